@@ -18,6 +18,7 @@ from adapter.shadowed import keep_apart, own_name
 
 if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` finds the same
     from adapter.discovery import Discovery
+    from adapter.effects.kept import with_kept
     from adapter.gap.result import GapResult
     from adapter.model.self_model import SelfModel
     from adapter.realtime import Snapshot, SnapshotReader
@@ -54,6 +55,7 @@ _FROM = {
     "filtered": "adapter.runs.library",
     "find_gap": "adapter.runs.library",
     "keep_law": "adapter.runs.library",
+    "with_kept": "adapter.effects.kept",
     "discover": "adapter.runs.library",
     "export": "adapter.runs.library",
     "SnapshotReader": "adapter.realtime",
@@ -90,6 +92,7 @@ __all__ = [
     "make_log",
     "read_log",
     "regressor",
+    "with_kept",
 ]
 
 

@@ -92,10 +92,10 @@ def _check_name(where: str, name: str) -> None:
 
 
 @contextmanager
-def with_kept(path: Path | None) -> Iterator[None]:
+def with_kept(path: Path | str | None) -> Iterator[None]:
     """The catalogue with the laws of a file, as long as the block lasts. Raises as `read_kept`."""
     with ExitStack() as stack:
-        for law in read_kept(path) if path is not None else ():
+        for law in read_kept(Path(path)) if path is not None else ():
             stack.enter_context(registered(law))
         yield
 

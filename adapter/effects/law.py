@@ -32,12 +32,9 @@ from adapter.effects.splits import SPEEDS, STILL, TURN
 
 LAW = "law: "  # begins the name of a law that has no other
 LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting
-CURVE_NM = 0.3  # of a curve's coefficients
+CURVE_NM = 0.3  # of a curve's coefficients, and of a law's torque
 EDGES = tuple(np.linspace(0.05, 0.95, 19))  # shares of a range in which something begins
-BENDS = tuple(np.geomspace(0.1, 3.0, 12))  # shares of the largest torque at which a sensor bends
 BY, MOST_JOINTS = "ⱼ", 32
-POWERS = (1.25, 1.5, 1.75, 2.25, 2.5, 2.75)  # below 1 it is friction that falls with speed
-TURNS = tuple(map(float, range(1, 21)))  # per turn
 
 
 SIGNALS = {  # powers of the units that they have
@@ -81,9 +78,10 @@ class Setting:
 
 EDGE = Setting("a", "rad", EDGES, within="q")
 PLAY = Setting("a", "N m", EDGES, within="|tau|", size=10.0, lower=0.0)
-BEND = Setting("a", "N m", BENDS, within="|tau|", size=10.0, lower=0.1)
-POWER = Setting("p", "", POWERS, lower=1.0)
-WAVE = Setting("n", "per turn", TURNS, wave=True)
+BEND = Setting("a", "N m", tuple(np.geomspace(0.1, 3.0, 12)), "|tau|", size=10.0, lower=0.1)
+# a power below 1 is friction that falls with speed
+POWER = Setting("p", "", (1.25, 1.5, 1.75, 2.25, 2.5, 2.75), lower=1.0)
+WAVE = Setting("n", "per turn", tuple(map(float, range(1, 21))), wave=True)
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from adapter.effects.base import (
     Values,
     polar,
 )
+from adapter.effects.law import LOG_ODDS
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import TURN
 
 # Harmonic drives and motors give 1, 2, 4 and the numbers of poles and rollers.
 NUMBERS = tuple(range(1, 31))
-CURVE_ODDS = -7.0  # as of what has no name
 
 
 class TorqueRipple(JointTorque):
@@ -44,8 +44,8 @@ class TorqueRipple(JointTorque):
         return tuple(Template((0.3, 0.3), partial(_decode, n), f"n = {n}") for n in NUMBERS)
 
     def log_odds_over(self, values: Values, turned: float) -> float:
-        """Less than a whole wave may be any curve over the angle."""
-        return 0.0 if values["n"] * turned > 2.0 * np.pi else CURVE_ODDS
+        """Less than a whole wave may be any curve over the angle, which has no name."""
+        return 0.0 if values["n"] * turned > 2.0 * np.pi else LOG_ODDS
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """a sin(n q + phase)."""

@@ -34,7 +34,7 @@ from adapter.effects.base import (
 )
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import HELD
-from adapter.effects.law import CURVES, DEGREE, LAWS, PIECES, WEIGHTS, Curve, Law, splines
+from adapter.effects.law import CURVE_NM, CURVES, DEGREE, LAWS, PIECES, WEIGHTS, Curve, Law, splines
 from adapter.effects.torque import added, bodies, moved_links, sensors
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.result import UNEXPLAINED
@@ -253,7 +253,7 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
 
 
 SLOW_PIECES = 10  # over time
-SIZE_NM, LEAST_RMS = 0.3, 1e-6
+LEAST_RMS = 1e-6
 LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
 LINE_HZ = (0.15, 9.0)
 SHARPENED, FINE = 12, 40  # rounds in which a line's frequency is sharpened; steps either way
@@ -288,7 +288,7 @@ class Pattern(TorqueEffect):
 
     def templates(self) -> tuple[Template, ...]:
         """All its coefficients at once."""
-        return (Template((SIZE_NM,) * self._count, lambda x: {"x": np.asarray(x)}),)
+        return (Template((CURVE_NM,) * self._count, lambda x: {"x": np.asarray(x)}),)
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """Coefficients times basis."""
@@ -331,7 +331,7 @@ def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]
         tried = [low + share * (high - low) for share in setting.tried] if setting else [1.0]
         for template in map(law.at, tried):
             rms = np.sqrt(np.mean([_power(at, law, template, joint) for at in stages]))
-            std = SIZE_NM / max(float(rms), LEAST_RMS)
+            std = CURVE_NM / max(float(rms), LEAST_RMS)
             scaled = (std,) * len(template.prior_std)
             out.append((law, joint, replace(template, prior_std=scaled)))
     return out

@@ -11,10 +11,9 @@ from adapter.effects.law import Curve, Law, OverSignals
 from adapter.gap.candidates import Pattern, signal_of
 from adapter.gap.fit import Fit, Named, between, place_of, refitted, under_own_noise
 from adapter.gap.rivals import price
-from adapter.gap.scan import BELIEF, FORMS, Lead, SignatureTable
+from adapter.gap.scan import BELIEF, BEST_OF_JOINT, FORMS, Lead, SignatureTable
 
 MOST_TERMS = 3  # of one joint: more are a curve with another name
-COMPARED = 4  # laws, each at its best setting
 PASSIVE = 0.03  # share of exchanged energy that a law may feed in and count as friction
 STEP = 0.1  # of what was seen: between two settings that are tried
 
@@ -124,7 +123,7 @@ def _with_law(fit: Fit, joint: int) -> Fit:
         if lead.candidate.possible(lead.x, lead.interval_s):
             best.setdefault(lead.candidate.effect.name, lead)
     found, most, place = fit, BELIEF, len(fit.named)
-    for lead in list(best.values())[:COMPARED]:
+    for lead in list(best.values())[:BEST_OF_JOINT]:
         if lead.log_evidence > BELIEF:
             more = _settled(fit.with_named((*fit.named, Named(lead.candidate, lead.x))), place)
             nats = _together(more, [place])

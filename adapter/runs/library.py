@@ -15,7 +15,7 @@ from adapter.discovery import Discovery
 from adapter.discovery import discover as discover_tree
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.export import robot_mjcf, robot_urdf
-from adapter.effects.kept import keep, with_kept
+from adapter.effects.kept import keep
 from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning, SettingsError
@@ -415,7 +415,6 @@ def find_gap(
     validate_from_s: float | None = None,
     hold_out: Sequence[Log | str | Path] = (),
     model_out: str | Path | None = None,
-    effects: str | Path | None = None,
 ) -> GapResult:
     """Where recordings and a model disagree, and which effects the model lacks (`adapter gap`).
 
@@ -426,7 +425,6 @@ def find_gap(
         validate_from_s: of one recording, fit before this second and score after it.
         hold_out: recordings to score on; where none is, blocks of time of all in turn.
         model_out: where the new model goes (.json).
-        effects: laws of one's own to look for by name, as `keep_law` writes them (.toml).
 
     Returns:
         `findings` (effect, joints from 1, parameters, std, evidence), `unexplained`, and the
@@ -434,7 +432,7 @@ def find_gap(
 
     Raises:
         ValueError: another robot, flipped signs, other units; says which.
-        DriverError, ModelError, SettingsError: a file that cannot be read.
+        DriverError, ModelError: a file that cannot be read.
 
     >>> import adapter
     >>> adapter.find_gap("recordings/panda_nominal_6s.mcap")
@@ -445,15 +443,14 @@ def find_gap(
     if inertia_prior is not None:
         settings = replace(settings, inertia_prior=inertia_prior)
     out = None if model_out is None else Path(model_out)
-    with with_kept(None if effects is None else Path(effects)):
-        return gap_of(several, model, settings, model_out=out)
+    return gap_of(several, model, settings, model_out=out)
 
 
 def keep_law(result: GapResult, name: str, path: str | Path, *, joint: int | None = None) -> str:
     """Add a law that `find_gap` found to a file of one's own (`adapter effects keep`).
 
     Args:
-        name: by which it is looked for with `find_gap(..., effects=path)`.
+        name: by which `find_gap` looks for it inside `with adapter.with_kept(path):`.
         joint: (from 1) whose law it is, where the result has several.
 
     Returns:

@@ -32,7 +32,7 @@ def driven(model: adapter.SelfModel) -> adapter.Log:
 log = driven(hosed)
 result = adapter.find_gap(log, panda, model_out="hosed.json")
 print(result)
-print(adapter.keep_law(result, "hose", "own.toml"))  # find_gap(other_log, effects="own.toml")
+print(adapter.keep_law(result, "hose", "own.toml"))  # with_kept("own.toml") looks for it again
 for model in (panda, adapter.load_model("hosed.json")):
     away = 1e3 * np.abs(driven(model).q - log.q)[:, 1].max()
     print(f"joint 2 moves by up to {away:.1f} mrad otherwise in the simulator")

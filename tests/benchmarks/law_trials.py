@@ -101,8 +101,7 @@ class Job(NamedTuple):
 
 def _trial(job: Job) -> tuple[Trial, str, dict[str, Any], tuple[Array, ...]]:
     """Drawn arm and motion, the law's name and what was drawn of it, readings with it."""
-    seed = job.seed
-    rng = np.random.default_rng([seed, 777])
+    seed, rng = job.seed, np.random.default_rng([job.seed, 777])
     friction = str(rng.choice(["none", "rubs", "sticks"]))
     motion = "points" if seed % 2 else "sines"
     trial = draw(seed, "null", None, friction != "none", motion, friction == "sticks")
@@ -128,8 +127,8 @@ def _trial(job: Job) -> tuple[Trial, str, dict[str, Any], tuple[Array, ...]]:
         q, dq, tau = sense(trial.arm, trial.effects, trial.times, *path, rubs)
         tau[:, j] += c * law(*path[:2], rigid)
         tau += trial.disturbance()
-    kind = {"within": name in WITHIN, "friction": friction, "motion": motion}
-    said = {**kind, "size_nm": size, "c": c, "joint": j + 1}
+    said = {"within": name in WITHIN, "friction": friction, "motion": motion}
+    said |= {"size_nm": size, "c": c, "joint": j + 1}
     return trial, name.replace("ⱼ", str(other + 1)), said, (q, dq, tau)
 
 
@@ -200,8 +199,8 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true", help="a tenth of the disturbance")
     args = parser.parse_args()
     rows: list[Row] = []
-    seeds = range(args.first, args.first + args.trials)
-    jobs = [Job(seed, args.none, args.simulator, args.quiet) for seed in seeds]
+    how = args.none, args.simulator, args.quiet
+    jobs = [Job(args.first + k, *how) for k in range(args.trials)]
     with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
         for row in filter(None, pool.map(run, jobs)):
             rows.append(row)
