@@ -32,8 +32,7 @@ from tests.helpers.gap_tools import recorded
 Array = np.ndarray
 Row = dict[str, Any]
 SIZES_NM, WRIST_SHARE = (0.1, 1.0), 0.3  # rms of the law's torque; of joints 5 to 7
-QUIET = 0.1  # of the disturbance
-FASTEST = 6.0  # rad/s
+QUIET, FASTEST = 0.1, 6.0  # of the disturbance; rad/s
 
 
 class Arm(NamedTuple):
