@@ -93,7 +93,18 @@ def _check_name(where: str, name: str) -> None:
 
 @contextmanager
 def with_kept(path: Path | str | None) -> Iterator[None]:
-    """The catalogue with the laws of a file, as long as the block lasts. Raises as `read_kept`."""
+    """The catalogue with the laws of a file, as long as the block lasts.
+
+    Args:
+        path: of the file, as `keep_law` writes it; None for none.
+
+    Raises:
+        OSError, SettingsError: as `read_kept`.
+
+    >>> import adapter
+    >>> with adapter.with_kept(None):
+    ...     result = adapter.find_gap("recordings/panda_nominal_6s.mcap")
+    """
     with ExitStack() as stack:
         for law in read_kept(Path(path)) if path is not None else ():
             stack.enter_context(registered(law))

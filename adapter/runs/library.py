@@ -458,6 +458,13 @@ def keep_law(result: GapResult, name: str, path: str | Path, *, joint: int | Non
 
     Raises:
         SettingsError: a result without such a law, a name that is taken; names the choices.
+
+    >>> import adapter
+    >>> result = adapter.find_gap("recordings/panda_nominal_6s.mcap")
+    >>> adapter.keep_law(result, "hose", "own.toml")
+    Traceback (most recent call last):
+        ...
+    adapter.errors.SettingsError: the result: no such law; have: none
     """
     return keep([finding.as_dict() for finding in result.findings], name, joint, Path(path))
 
