@@ -39,11 +39,12 @@ def run(args: argparse.Namespace) -> int:
         (MATRIX_HEADS, difference_matrix(found)),
         (EFFECT_HEADS, effect_rows(found)),
     ):
+        if not rows:
+            continue
         table = Table(*heads, box=None, pad_edge=False, title_justify="left", padding=(0, 2, 0, 0))
         for row in rows:
             table.add_row(*row)  # cells hold lines of their own
-        if rows:
-            shown.print(table)
+        shown.print(table)
     if found.changes:
         shown.print(LEGEND, soft_wrap=True)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,17 +41,13 @@ class JointSpring(LearnedEffect, JointTorque):
 
     def templates_over(self, low: float, high: float) -> tuple[Template, ...]:
         """Two springs that rest at the ends of what was seen: none is likelier near zero."""
-
-        def decode(x: Array) -> dict[str, Any]:
-            k = float(x[0] + x[1])
-            return {"k": k, "q0": float(low * x[0] + high * x[1]) / k if k else 0.0}
-
+        decode = partial(self.decode, low=low, high=high)
         return (Template(self.prior_std, decode, f"between {low:.4g} and {high:.4g}"),)
 
-    def decode(self, x: Array) -> dict[str, Any]:
-        """Of two springs that rest at 0 and at 1 rad."""
+    def decode(self, x: Array, low: float = 0.0, high: float = 1.0) -> dict[str, Any]:
+        """Of two springs that rest at two angles, rad."""
         k = float(x[0] + x[1])
-        return {"k": k, "q0": float(x[1]) / k if k else 0.0}
+        return {"k": k, "q0": float(low * x[0] + high * x[1]) / k if k else 0.0}
 
     def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """q and q - 1 rad."""

@@ -93,12 +93,14 @@ class Expression:
         powers: of its signals, for the coefficient's unit.
         term: of the signals and the setting, where there is one.
         setting: that it has.
+        drags: whether it is friction by speed alone, which takes energy or is none.
     """
 
     text: str
     powers: Mapping[str, int]
     term: Callable[[JointSignals, Array], Array]
     setting: Setting | None = None
+    drags: bool = False
 
     @property
     def unit(self) -> str:
@@ -128,11 +130,11 @@ def _power(at: JointSignals, p: Array) -> Array:
 def _grammar() -> tuple[Expression, ...]:
     """Every expression that is tried."""
     out = [
-        Expression("dq |dq|", {"dq": 2}, lambda at, _: at.dq * np.abs(at.dq)),
-        Expression("dq³", {"dq": 3}, lambda at, _: at.dq**3),
+        Expression("dq |dq|", {"dq": 2}, lambda at, _: at.dq * np.abs(at.dq), drags=True),
+        Expression("dq³", {"dq": 3}, lambda at, _: at.dq**3, drags=True),
         Expression("|dq|", {"dq": 1}, lambda at, _: np.abs(at.dq)),
         Expression("dq²", {"dq": 2}, lambda at, _: at.dq**2),
-        Expression("sign(dq) |dq|^p", {}, _power, POWER),
+        Expression("sign(dq) |dq|^p", {}, _power, POWER, drags=True),
         Expression("q²", {"q": 2}, lambda at, _: at.q**2),
         Expression("(q - a)³", {"q": 3}, lambda at, a: (at.q - a) ** 3, EDGE),
         Expression("max(q - a, 0)", {"q": 1}, _above, EDGE),
@@ -217,8 +219,7 @@ class Law(OverSignals):
         self.title = f"torque of c {text}"  # type: ignore[misc]
         self.variables = frozenset(re.findall(r"ddq|dq|tau|q", expression.text))
         self.by_load = "tau" in self.variables  # type: ignore[misc]
-        drags = self.variables == {"dq"} and not by and text not in ("|dq|", "dq²")
-        self.positive = ("c",) if drags else ()  # type: ignore[misc]
+        self.positive = ("c",) if expression.drags else ()  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
         own = [Parameter("c", expression.unit)]
         own += [Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []

@@ -318,16 +318,13 @@ def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]
 
     How large a law may well be is known of its torque, not of its coefficient.
     """
-    out, ranges = list[tuple[Law, int, Template]](), {"": (0.0, 1.0)}
-    q = np.concatenate([at.links.q[:, joint] for at in stages])
-    ranges["q"] = float(q.min()), float(q.max())
-    ranges["|tau|"] = 0.0, max(float(np.abs(at.rigid[:, joint]).max()) for at in stages)
+    out, seen = list[tuple[Law, int, Template]](), ranges(stages, joint)
     kept = {effect.in_files for effect in CATALOGUE.values()}  # by another name
     for law in LAWS.values():
         if law.by > stages[0].links.arm.n or law.by == joint + 1 or law.name in kept:
             continue
         setting = law.expression.setting
-        low, high = ranges[setting.within if setting else ""]
+        low, high = seen[setting.within if setting else ""]
         tried = [low + share * (high - low) for share in setting.tried] if setting else [1.0]
         for template in map(law.at, tried):
             rms = np.sqrt(np.mean([_power(at, law, template, joint) for at in stages]))
@@ -335,6 +332,13 @@ def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]
             scaled = (std,) * len(template.prior_std)
             out.append((law, joint, replace(template, prior_std=scaled)))
     return out
+
+
+def ranges(stages: Sequence[Stages], joint: int) -> dict[str, tuple[float, float]]:
+    """What a joint's (from 0) signals were seen between, by the name that a setting has for it."""
+    q = np.concatenate([at.links.q[:, joint] for at in stages])
+    most = max(float(np.abs(at.rigid[:, joint]).max()) for at in stages)
+    return {"": (0.0, 1.0), "q": (float(q.min()), float(q.max())), "|tau|": (0.0, most)}
 
 
 def _power(at: Stages, law: Law, template: Template, joint: int) -> float:

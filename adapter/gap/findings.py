@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -89,36 +89,20 @@ def _doubts(fit: Fit, known: Carried | Moments) -> tuple[Fit, Array]:
 
 def _curve(fit: Fit, covariance: Array, k: int) -> dict[str, Any] | None:
     """A law's torque over the range of its signal that was seen, and its standard deviation."""
-    named, own = fit.named[k], place_of(fit, k)
-    law, template = named.candidate.effect, named.candidate.template
+    named, law = fit.named[k], fit.named[k].candidate.effect
     if not isinstance(law, OverSignals):
         return None
     joint, at = law.by - 1 if law.by else named.candidate.joint, fit.model.stages(0)
     seen = signal_of(law.along, at.links, at.rigid, joint)
     x = np.linspace(seen.min(), seen.max(), CURVE_POINTS)
-    y, steps = law.curve(x, named.values), DIFFERENCE * named.candidate.prior_std
-    slopes = np.array(
-        [
-            (law.curve(x, template.decode(named.x + step * unit)) - y) / step
-            for step, unit in zip(steps, np.eye(len(named.x)), strict=True)
-        ]
-    )
-    std = np.sqrt(np.einsum("ik,ij,jk->k", slopes, covariance[np.ix_(own, own)], slopes))
-    return {"over": f"{law.along}{joint + 1}", "at": x, "torque_nm": y, "std_nm": std}
+    std = _std_of(lambda values: law.curve(x, values), fit, covariance, k)
+    torque = law.curve(x, named.values)
+    return {"over": f"{law.along}{joint + 1}", "at": x, "torque_nm": torque, "std_nm": std}
 
 
 def parameter_std(fit: Fit, covariance: Array, k: int) -> dict[str, Any]:
     """Standard deviations of the parameters of the k-th named effect, through its decoding."""
-    named, own = fit.named[k], place_of(fit, k)
-    template, steps = named.candidate.template, DIFFERENCE * named.candidate.prior_std
-    at = _flat(named.values)
-    slopes = np.array(
-        [
-            (_flat(template.decode(named.x + step * unit)) - at) / step
-            for step, unit in zip(steps, np.eye(len(named.x)), strict=True)
-        ]
-    )
-    deviations = np.sqrt(np.einsum("ip,ij,jp->p", slopes, covariance[np.ix_(own, own)], slopes))
+    named, deviations = fit.named[k], _std_of(_flat, fit, covariance, k)
     std, place = {}, 0
     on_grid = {p.key: p.grid_share for p in named.candidate.effect.parameters if p.grid_share}
     for key, value in named.values.items():
@@ -129,6 +113,22 @@ def parameter_std(fit: Fit, covariance: Array, k: int) -> dict[str, Any]:
             std[key] = on_grid[key] * abs(float(value))
         place += size
     return std
+
+
+def _std_of(
+    of_values: Callable[[dict[str, Any]], Array], fit: Fit, covariance: Array, k: int
+) -> Array:
+    """Standard deviations (p,) of what hangs on the parameters of the k-th named effect."""
+    named, own = fit.named[k], place_of(fit, k)
+    decode, steps = named.candidate.template.decode, DIFFERENCE * named.candidate.prior_std
+    at = of_values(named.values)
+    slopes = np.array(
+        [
+            (of_values(decode(named.x + step * unit)) - at) / step
+            for step, unit in zip(steps, np.eye(len(named.x)), strict=True)
+        ]
+    )
+    return np.sqrt(np.einsum("ip,ij,jp->p", slopes, covariance[np.ix_(own, own)], slopes))
 
 
 def _flat(values: dict[str, Any]) -> Array:

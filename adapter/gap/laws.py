@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from adapter.effects.law import Curve, Law, OverSignals
-from adapter.gap.candidates import Pattern, signal_of
+from adapter.gap.candidates import Pattern, ranges, signal_of
 from adapter.gap.fit import Fit, Named, between, place_of, refitted, under_own_noise
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, BEST_OF_JOINT, FORMS, Lead, SignatureTable
@@ -28,7 +28,7 @@ def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
     return fit
 
 
-def bare(before: Fit, after: Fit) -> set[int]:
+def left_without(before: Fit, after: Fit) -> set[int]:
     """Joints (from 0) that had a pattern and are left without any law or curve."""
     had = {e.candidate.joint for e in before.named if _is_curve(before, e)}
     return had - {
@@ -75,18 +75,16 @@ def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
         if lawful is before:
             break
     new = range(len(rest), len(lawful.named))
-    noise = (fit.noise, under_own_noise(lawful)[0].noise)
-    least = min(noise, key=lambda own: max(float(x.level[joint]) for x in own))
-    worth_it, asked = (
-        _together(lawful.with_noise(least), new),
-        _together(fit.with_noise(least), places),
-    )
-    if any(fit.named[k].is_pattern for k in places):
-        asked -= BELIEF
-    elif not any(_nameless(fit.named[k]) for k in places):
-        asked += BELIEF
-    if new and worth_it > asked:
-        return lawful
+    if new:
+        noise = (fit.noise, under_own_noise(lawful)[0].noise)
+        least = min(noise, key=lambda own: max(float(x.level[joint]) for x in own))
+        asked = _together(fit.with_noise(least), places)
+        if any(fit.named[k].is_pattern for k in places):
+            asked -= BELIEF
+        elif not any(_nameless(fit.named[k]) for k in places):
+            asked += BELIEF
+        if _together(lawful.with_noise(least), new) > asked:
+            return lawful
     fit = fit.with_named([_as_curve(fit, e) if k in places else e for k, e in enumerate(fit.named)])
     for k in places:
         if isinstance(fit.named[k].candidate.effect, Law):
@@ -96,7 +94,7 @@ def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
 
 def _together(fit: Fit, places: Sequence[int]) -> float:
     """Nats that named effects are worth together, their odds included."""
-    own = np.concatenate([place_of(fit, k) for k in places]) if places else np.zeros(0, int)
+    own = np.concatenate([place_of(fit, k) for k in places])
     carried = fit.carried()
     found = carried.worth(own, np.delete(np.arange(len(carried.g)), own))
     return found.log_evidence + sum(price(fit.named[k]) for k in places)
@@ -164,12 +162,10 @@ def _settled(fit: Fit, place: int) -> Fit:
         template = replace(template, prior_std=c.template.prior_std)
         return replace(named, candidate=replace(c, template=template))
 
-    seen, stages = float(np.ptp(setting.tried)), fit.model.stages(0)
-    if setting.within:
-        own = signal_of(setting.within.strip("|"), stages.links, stages.rigid, c.joint)
-        seen = float(np.ptp(own))
-    value = float(named.values[setting.key])
-    return refitted(between(fit, place, value, STEP * seen, at))[0]
+    stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
+    low, high = ranges(stages, c.joint)[setting.within]
+    step = STEP * (high - low) * (1.0 if setting.within else float(np.ptp(setting.tried)))
+    return refitted(between(fit, place, float(named.values[setting.key]), step, at))[0]
 
 
 def in_doubt(fit: Fit) -> Fit:

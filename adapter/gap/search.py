@@ -27,7 +27,7 @@ from adapter.gap.fit import (
     worth,
 )
 from adapter.gap.folds import Folds, pays_held_out
-from adapter.gap.laws import bare, lawful
+from adapter.gap.laws import lawful, left_without
 from adapter.gap.real_arm import BRISTLES, COULOMB, start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
@@ -123,7 +123,7 @@ def search(
     progress("laws of what no effect explains")
     fit = lawful(found.fit)
     if fit is not found.fit:
-        lawless = bare(found.fit, (judged := settled(fit, joints)).fit)
+        lawless = left_without(found.fit, (judged := settled(fit, joints)).fit)
         found = settled(lawful(found.fit, lawless), joints) if lawless else judged
     found = _as_resolved(found)
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)

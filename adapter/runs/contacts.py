@@ -57,8 +57,8 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
         return Kind.OPEN
     since_s, q, dq, torque, std = np.array(seen).transpose(1, 0, 2).copy()
     times = since_s[:, 0]
-    cubics = np.polynomial.polynomial.polyder(np.polynomial.polynomial.polyfit(times, dq, 3))
-    ddq = np.ascontiguousarray(np.polynomial.polynomial.polyval(times, cubics).T)
+    rates = np.polynomial.polynomial.polyder(np.polynomial.polynomial.polyfit(times, dq, 3))
+    ddq = np.ascontiguousarray(np.polynomial.polynomial.polyval(times, rates).T)
     joints = JointMotion(q, dq, ddq)
     crude = CRUDE * np.sqrt((torque**2).mean(axis=0))
     weight = 1.0 / np.sqrt(ALIKE * (std**2 + crude**2))
