@@ -343,9 +343,9 @@ class Effect(ABC):
         """
         return ()
 
-    def reshaped(self, values: Values, ratio: float) -> Template | None:
-        """A template with the nonlinear setting in `values` times `ratio`; None without one."""
-        return None
+    def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:
+        """Templates with one of the nonlinear settings in `values` times `ratio` each."""
+        return ()
 
     def over(self, seconds: float) -> Effect:
         """The effect as it is looked for in a recording that lasts so long."""
@@ -437,10 +437,6 @@ class TorqueEffect(Effect):
 
     after_sensors: ClassVar[bool] = False
     by_load: ClassVar[bool] = False
-
-    def bristles(self, values: Values) -> tuple[float, float] | None:
-        """(level N m, way rad) of what bends along the way before it slides, if it does."""
-        return None
 
     @abstractmethod
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:

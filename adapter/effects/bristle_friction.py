@@ -7,7 +7,8 @@ rest it is the band of static friction. Source: P. Dahl, A Solid Friction Model,
 
 from __future__ import annotations
 
-from typing import Any
+from abc import abstractmethod
+from typing import Any, cast
 
 import numpy as np
 
@@ -59,7 +60,26 @@ def bending(q: Array, s0: float) -> Array:
     return z[:, 0]
 
 
-class BristleFriction(LearnedEffect, JointTorque):
+class Rubs(JointTorque):
+    """Friction that may wind up over a small way s0 before the joint slides."""
+
+    @abstractmethod
+    def level(self, dq: Array, values: Values) -> Array:
+        """N m of a joint that slides at dq, rad/s."""
+
+    def bristles(self, values: Values) -> float | None:
+        """s0, where it has one."""
+        return float(values["s0"]) if "s0" in values else None
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """The level times z, which is zero before the motion; of rows apart as if each slid."""
+        dq, s0 = motion.dq[:, joint], self.bristles(values)
+        at_once = motion.apart or s0 is None
+        z = smooth_sign(dq) if at_once else bending(motion.q[:, joint], cast(float, s0))
+        return on_joint(motion, joint, self.level(dq, values) * z)
+
+
+class BristleFriction(LearnedEffect, Rubs):
     """Coulomb friction that winds up over a small way before the joint slides."""
 
     name = "bristle_friction"
@@ -80,13 +100,17 @@ class BristleFriction(LearnedEffect, JointTorque):
         """The level, at several ways; at once it is Coulomb friction."""
         return tuple(map(_template, WAYS_RAD[1:]))
 
-    def reshaped(self, values: Values, ratio: float) -> Template | None:
+    def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:
         """Another s0."""
-        return _template(WAY.nearest(ratio * float(values["s0"])))
+        return (_template(WAY.nearest(ratio * float(values["s0"]))),)
 
     def log_odds_of(self, values: Values) -> float:
         """Friction that slides at once looks like bristles over a way that no joint has."""
-        return float(-0.5 * (np.log(values["s0"] / USUAL_RAD) / np.log(TIMES)) ** 2)
+        return log_odds_of_way(float(values["s0"]))
+
+    def level(self, dq: Array, values: Values) -> Array:
+        """Fc."""
+        return np.full_like(dq, values["Fc"])
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""
@@ -106,21 +130,14 @@ class BristleFriction(LearnedEffect, JointTorque):
         """Those of the ways around s0."""
         return shares_of_ways(shape)
 
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """Fc z, z zero before the motion; of rows apart as if each slid."""
-        if motion.apart:
-            z = smooth_sign(motion.dq[:, joint])
-        else:
-            z = bending(motion.q[:, joint], float(values["s0"]))
-        return on_joint(motion, joint, float(values["Fc"]) * z)
-
-    def bristles(self, values: Values) -> tuple[float, float]:
-        """Fc and s0."""
-        return float(values["Fc"]), float(values["s0"])
-
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """The level, as dry friction."""
         return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
+
+
+def log_odds_of_way(s0: float) -> float:
+    """ln of how much rarer bristles over s0 (rad) are met than those of a usual way."""
+    return float(-0.5 * (np.log(s0 / USUAL_RAD) / np.log(TIMES)) ** 2)
 
 
 def _template(s0: float) -> Template:

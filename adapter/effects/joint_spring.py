@@ -20,6 +20,9 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import TURN
 from adapter.model.urdf_text import STIFFNESS, Additions
 
+# Farther from zero no joint's spring rests, unless it is at zero but for an offset so small
+FARTHEST_RAD, NOTHING_NM = np.pi, 0.02
+
 
 class JointSpring(LearnedEffect, JointTorque):
     """A spring between a joint's two sides.
@@ -48,6 +51,11 @@ class JointSpring(LearnedEffect, JointTorque):
         """Of two springs that rest at two angles, rad."""
         k = float(x[0] + x[1])
         return {"k": k, "q0": float(low * x[0] + high * x[1]) / k if k else 0.0}
+
+    def possible(self, values: Values) -> bool:
+        """What rests at no angle that a joint has is an offset by another name."""
+        k, q0 = float(values["k"]), float(values["q0"])
+        return abs(q0) < FARTHEST_RAD or abs(k * q0) < NOTHING_NM
 
     def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """q and q - 1 rad."""

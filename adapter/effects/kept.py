@@ -42,14 +42,13 @@ class KeptLaw(Law):
         std = abs(float(self._values["c"])) or 1.0
         return (replace(template, prior_std=(std,) * len(template.prior_std)),)
 
-    def reshaped(self, values: Values, ratio: float) -> Template | None:
+    def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:
         """Another setting, of one that is no whole number."""
         setting = self.expression.setting
         if setting is None or setting.wave:
-            return None
-        return replace(
-            self.at(ratio * float(values[setting.key])), prior_std=self.templates()[0].prior_std
-        )
+            return ()
+        other = self.at(ratio * float(values[setting.key]))
+        return (replace(other, prior_std=self.templates()[0].prior_std),)
 
 
 def read_kept(path: Path) -> list[KeptLaw]:

@@ -38,10 +38,16 @@ class SignalDelay(SensorEffect):
         return 0.0 < float(values["d"]) < MOST_S
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """tau(t - d): by its rate, which is exact enough for a few ms of smooth torque."""
-        late = tau - float(values["d"]) * motion.rate(tau)
+        """tau(t - d): whole samples later, and by its rate what is less."""
+        d = float(values["d"])
+        step = 0.0 if motion.apart else float(np.median(np.diff(motion.t)))
+        whole = step * round(d / step) if step else 0.0
+        before = tau
+        if whole:
+            before = np.column_stack([np.interp(motion.t - whole, motion.t, x) for x in tau.T])
+        late = before - (d - whole) * motion.rate(before)
         if joint < 0:
-            return late
+            return np.asarray(late)
         out = tau.copy()
         out[:, joint] = late[:, joint]
         return np.asarray(out)

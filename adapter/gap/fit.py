@@ -533,7 +533,7 @@ def dated_anew(fit: Fit) -> Fit:
 def shaped(fit: Fit, place: int) -> Fit:
     """A named effect with the nonlinear setting that the data like best."""
     effect = fit.named[place].candidate.effect
-    if effect.reshaped(fit.named[place].values, 1.0) is None:
+    if not effect.reshaped(fit.named[place].values, 1.0):
         return fit
     if isinstance(effect, TorqueEffect) and not effect.by_load:
         return _reshaped(fit, place)
@@ -547,13 +547,12 @@ def shaped(fit: Fit, place: int) -> Fit:
 
 
 def _other_shapes(named: Named, step: float) -> list[Named]:
-    """A named effect with a setting up to two steps larger or smaller."""
-    out = []
+    """A named effect with one of its settings up to two steps larger or smaller."""
+    out, own = [], named.candidate
     for ratio in (step**-2, 1.0 / step, step, step**2):
-        template = named.candidate.effect.reshaped(named.values, ratio)
-        assert template is not None
-        template = replace(template, prior_std=named.candidate.template.prior_std)
-        out.append(replace(named, candidate=replace(named.candidate, template=template)))
+        for template in own.effect.reshaped(named.values, ratio):
+            template = replace(template, prior_std=own.template.prior_std)
+            out.append(replace(named, candidate=replace(own, template=template)))
     return out
 
 
@@ -597,8 +596,7 @@ def _with_shape(fit: Fit, carried: Carried, place: int, other: Named) -> Carried
 def lost_at_once(fit: Fit, carried: Carried, place: int) -> float:
     """By how much less a fit explains (chi2) if bristles wind up over no way."""
     named = fit.named[place]
-    at_once = named.candidate.effect.reshaped(named.values, 0.0)
-    assert at_once is not None
+    *_, at_once = named.candidate.effect.reshaped(named.values, 0.0)
     other = replace(named, candidate=replace(named.candidate, template=at_once))
     trial = _with_shape(fit, carried, place, other)
     return float(carried.g @ carried.x - trial.g @ trial.x)

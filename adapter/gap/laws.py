@@ -7,12 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from adapter.effects.by_joint import STRIBECK_SPEED
+from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.law import Curve, Law, OverSignals
-from adapter.gap.candidates import Pattern, ranges, signal_of
-from adapter.gap.fit import Fit, Named, between, place_of, refitted, under_own_noise
+from adapter.gap.candidates import Candidate, Pattern, prior_log_odds, ranges, signal_of
+from adapter.gap.evidence import Noise
+from adapter.gap.fit import Fit, Named, between, place_of, refitted, shaped, under_own_noise
+from adapter.gap.real_arm import BRISTLES
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, BEST_OF_JOINT, FORMS, Lead, SignatureTable
 
+STRIBECK = CATALOGUE["stribeck_friction"]
 MOST_TERMS = 3  # of one joint: more are a curve with another name
 PASSIVE = 0.03  # share of exchanged energy that a law may feed in and count as friction
 STEP = 0.1  # of what was seen: between two settings that are tried
@@ -24,6 +29,7 @@ def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
     Joints (from 0) that are `without` any law keep what they have.
     """
     for joint in sorted({e.candidate.joint for e in fit.named if _gives_way(e)}):
+        fit = _falling(fit, joint)
         fit = _of_joint(fit, joint, MOST_TERMS if joint not in without else 0)
     return fit
 
@@ -76,8 +82,7 @@ def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
             break
     new = range(len(rest), len(lawful.named))
     if new:
-        noise = (fit.noise, under_own_noise(lawful)[0].noise)
-        least = min(noise, key=lambda own: max(float(x.level[joint]) for x in own))
+        least = _least(fit, under_own_noise(lawful)[0], joint)
         asked = _together(fit.with_noise(least), places)
         if any(fit.named[k].is_pattern for k in places):
             asked -= BELIEF
@@ -90,6 +95,34 @@ def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
         if isinstance(fit.named[k].candidate.effect, Law):
             fit = _settled(fit, k)
     return fit
+
+
+def _falling(fit: Fit, joint: int) -> Fit:
+    """With bristles whose level falls with the speed, where that says more than what has no name.
+
+    Bristles of one level have the doubt of slow rows, which hides that they are not of one level.
+    """
+    places = [k for k, e in enumerate(fit.named) if e.candidate.joint == joint and _nameless(e)]
+    bare = fit.with_named([e for k, e in enumerate(fit.named) if k not in places])
+    for k, e in enumerate(bare.named if places else ()):
+        if e.candidate.effect is not BRISTLES or e.candidate.joint != joint:
+            continue
+        template = STRIBECK.reshaped({"vs": STRIBECK_SPEED, "s0": e.values["s0"]}, 1.0)[0]
+        odds = prior_log_odds(STRIBECK, joint, fit.n, len(STRIBECK.templates()))
+        falling = Named(Candidate(STRIBECK, template, joint, (), odds), np.repeat(e.x, 2))
+        other, _ = under_own_noise(shaped(refitted(bare.instead(k, falling))[0], k))
+        asked, found = (
+            replace(x, noise=_least(fit, other, joint), doubts=other.doubts) for x in (bare, other)
+        )
+        a, b = (_together(refitted(x)[0], [k]) for x in (asked, found))
+        if other.named[k].possible and b > a + BELIEF:
+            return other.with_named([*other.named, *(fit.named[i] for i in places)])
+    return fit
+
+
+def _least(fit: Fit, other: Fit, joint: int) -> tuple[Noise, ...]:
+    """The noise of that which leaves less of a joint's torque."""
+    return min((fit.noise, other.noise), key=lambda own: max(float(x.level[joint]) for x in own))
 
 
 def _together(fit: Fit, places: Sequence[int]) -> float:

@@ -261,8 +261,11 @@ def _puts_down(e: Named | Lead) -> bool:
 
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
-    """Without what no longer pays beside the others, each by its best name, under its own noise."""
-    fit = usually_shaped(fit)
+    """Without what no longer pays beside the others, each by its best name, under its own noise.
+
+    What gave way beside other effects than there are now is a name once more.
+    """
+    fit = usually_shaped(fit.with_named([replace(e, tried=frozenset()) for e in fit.named]))
     swaps, before = 0, None  # the fit before names were exchanged, until that is judged
     while True:
         fit, carried = under_own_noise(fit)
@@ -411,5 +414,5 @@ def _swapped(fit: Fit, standings: Sequence[Standing], unnamed: Container[int]) -
         named = fit.named[k]
         tried = named.tried | {named.candidate.key}
         other = replace(named, candidate=rival.candidate, x=rival.x, assumed=False, tried=tried)
-        fit = fit.instead(k, other)
+        fit = shaped(fit.instead(k, other), k)
     return fit

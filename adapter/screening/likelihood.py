@@ -39,6 +39,7 @@ BEYOND_RAD, BEYOND = 0.2, 100.0  # over a limit; what a recording all beyond it 
 EXPLAINED, BEST_EXPLAINED = 0.5, 0.85
 # Of torques that come late: steps in which it is sought and how many, ms; less than `LATE_S` is
 # within the timing of samples.
+TURNS = 5  # times as many rows, among which are some of each way back
 LATE_STEPS, LATEST_MS, LATE_S = ((20, 10), (4, 4), (1, 3)), 219, 0.004
 
 
@@ -261,7 +262,15 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     if abs(late_ms) <= 1e3 * LATE_S or cost(late_ms) > cost(0) - EVIDENCE:
         return 0.0
     rival = telling.explained(telling.rubbing(rows, q, at)).cost
-    return 1e-3 * late_ms if cost(late_ms) < rival - EVIDENCE else 0.0
+    if cost(late_ms) > rival - EVIDENCE:
+        return 0.0
+    at = np.linspace(LATEST_MS, len(q) - 1 - LATEST_MS, TURNS * ROWS).astype(int)
+    for step, reach in LATE_STEPS[1:]:  # what winds up is late by itself
+        rows = Rows(q[at], dq[at], ddq[at], tau[at + late_ms])
+        of = telling.explaining(telling.rubbing(rows, q, at))
+        near = (late_ms + step * k for k in range(-reach, reach + 1))
+        late_ms = min((x for x in near if abs(x) <= LATEST_MS), key=cost)
+    return 1e-3 * late_ms
 
 
 def inertial_std(arm: RigidArm) -> Array:

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
 from adapter.effects.active import Active
-from adapter.effects.base import TorqueEffect
-from adapter.effects.bristle_friction import bend
+from adapter.effects.bristle_friction import Rubs, bend
 from adapter.effects.by_joint import smooth_sign
 from adapter.model.spatial import Array
 
 
-def bristles_of(active: Active) -> tuple[float, float] | None:
-    """(level N m, way rad) of an effect at work that has bristles."""
-    return (
-        active.effect.bristles(active.values) if isinstance(active.effect, TorqueEffect) else None
-    )
-
-
 def with_bristles(effects: Sequence[Active]) -> list[Active]:
     """Those that have bristles."""
-    return [active for active in effects if bristles_of(active)]
+    return [a for a in effects if isinstance(a.effect, Rubs) and a.effect.bristles(a.values)]
 
 
 class Bristles:
@@ -41,8 +34,8 @@ class Bristles:
     def __init__(self, effects: Sequence[Active], n: int, period_s: float) -> None:
         self.effects, self._n, self._period_s = with_bristles(effects), n, period_s
         self._joint = [active.joint for active in self.effects]
-        numbers = [bristles_of(active) for active in self.effects]
-        self._level, self._way = np.array(numbers, dtype=float).reshape(-1, 2).T
+        self._way = np.array([a.values["s0"] for a in self.effects], dtype=float)
+        self._most = self._levels(np.zeros(len(self.effects)))
         self._along: tuple[Array, Array] | None = None
         self.reset()
 
@@ -80,9 +73,15 @@ class Bristles:
         if self._at is None:
             self._at, self._z = q.copy(), smooth_sign(dq[self._joint])
         light = 1.0 / np.diag(np.linalg.inv(mass))[self._joint]
-        way = np.maximum(self._way, self._level * self._period_s**2 / light)
+        way = np.maximum(self._way, self._most * self._period_s**2 / light)
         bend((q - self._at)[None, self._joint], way, self._z, np.empty((1, len(way))))
         self._at = q.copy()
         on = [active in acting for active in self.effects]
-        np.add.at(out, self._joint, self._level * self._z * on)
+        np.add.at(out, self._joint, self._levels(dq[self._joint]) * self._z * on)
         return out
+
+    def _levels(self, dq: Array) -> Array:
+        """(b,) N m at which they slide at dq (b,), rad/s."""
+        pairs = zip(self.effects, dq[:, None], strict=True)
+        levels = [cast(Rubs, a.effect).level(own, a.values) for a, own in pairs]
+        return np.concatenate([np.zeros(0), *levels])

@@ -27,6 +27,7 @@ N, J = 7, 3  # joints; the one that has an effect, from 0
 PANDA = documented("panda")
 REMEMBER = {
     "bristle_friction": {"Fc": 2.0, "s0": 3e-3},
+    "stribeck_friction": {"Fc": 1.0, "Fs": 2.0, "vs": 0.05, "s0": 3e-3},
     "joint_elasticity": {"k": 2000.0},
     "backlash": {"b": 0.01},
     "torque_filter": {"d": 5e-3, "c": 1.5e-4},

@@ -80,7 +80,6 @@ def test_a_finer_friction_is_not_given_up_for_coulombs(seed, effect, tmp_path: P
 def test_a_search_for_another_shape_stays_among_those_that_may_be(
     effect: Fitted, key: str, ratio: float
 ) -> None:
-    told = effect.reshaped({"Fc": 0.3, "Fs": 0.4, key: 1e-2}, ratio)
-    assert told is not None
+    (told,) = effect.reshaped({"Fc": 0.3, "Fs": 0.4, key: 1e-2}, ratio)
     bounds = next(p for p in effect.parameters if p.key == key)
     assert bounds.lower <= told.decode(np.array([0.3, 0.4]))[key] <= bounds.upper

@@ -152,6 +152,19 @@ def test_an_arm_that_rests_may_well_hold_the_same_torque() -> None:
     assert not stuck(t[:1], np.ones_like(tau[:1]), tau[:1]).any()
 
 
+def test_a_sensor_that_ends_is_told_by_its_noise_and_no_pause_is_a_stay() -> None:
+    t, rng = 1e-3 * np.arange(3000), np.random.default_rng(1)
+    slow, noise = np.full((3000, 1), 0.04), rng.standard_normal((3000, 1))
+    slow[0] = 0.1
+    clipped = np.minimum(5.0 * np.sin(t)[:, None] + 0.1 * noise, 3.0)
+    assert (stuck(t, slow, clipped) == (clipped == 3.0)).all()
+    rests = np.minimum(5.0 * np.sin(t)[:, None], 3.0)
+    rests[:1000] = 1.0  # without noise it may well rest at the end of its range
+    assert not stuck(t, slow, rests).any()
+    noise[1500] = noise[1501]
+    assert not stuck(t + 60.0 * (t > 1.5005), 10.0 * slow, noise).any()
+
+
 def test_pauses_that_leave_no_second_together_are_told() -> None:
     short = base().take(slice(0, 2200))
     late = (np.arange(2200) > 1100) * 60_000_000_000

@@ -131,14 +131,14 @@ def test_friction_holds_still_without_chattering(simulator: str) -> None:
 
 
 @pytest.mark.parametrize("simulator", list(SIMULATORS))
-@pytest.mark.parametrize("s0", [1e-5, 4e-3])
-def test_bristles_wind_up_and_hold(simulator: str, s0: float) -> None:
+@pytest.mark.parametrize(("s0", "falls"), [(1e-5, {}), (4e-3, {}), (4e-3, {"Fs": 0.5, "vs": 0.3})])
+def test_bristles_wind_up_and_hold(simulator: str, s0: float, falls: dict[str, float]) -> None:
     """A push that slowly rises to 0.6 Fc winds a joint up by -s0 ln(1 - 0.6), and no further."""
     joints, level = tuple(range(1, 8)), 0.5
-    model = model_with(
-        Effect("bristle_friction", joints, {"Fc": level, "s0": s0}),
-        Effect("viscous_friction", joints, {"Fv": 5.0}),  # or the arm swings on its bristles
-    )
+    damped = model_with(Effect("viscous_friction", joints, {"Fv": 5.0}))  # or it swings on bristles
+    name, more = ("stribeck", falls | {"Fc": 0.3}) if falls else ("bristle", {"Fc": level})
+    rubs = {"effect": f"{name}_friction", "joints": list(joints), "parameters": more | {"s0": s0}}
+    model = replace(damped, effects=(*damped.effects, rubs))
     arm, way = placed(simulator, model), np.array([1, -1, 1, -1, 1, -1, 1])
     for k in range(1000):
         arm.step(torque_of(arm.state()[0]) + 0.6 * level * min(k / 700, 1.0) * way)
