@@ -7,7 +7,6 @@ limited. Inputs are good ones with bytes or words changed, cut, doubled or put i
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -27,6 +26,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from tests.helpers.benchmark import options, write
 
 LIMIT_S, LIMIT_BYTES = 5.0, 2**30
 WORDS = (
@@ -421,14 +422,12 @@ def try_one(name: str, count: int, seconds: float, seed: int, keep: Path) -> dic
 
 def main_trials() -> int:
     """All decoders, each in a process of its own; 1 where there was a fault."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, seed=0)
     add = parser.add_argument
     add("--count", type=int, default=1_000_000, help="inputs altogether")
     add("--seconds", type=float, default=600.0, help="at most, for each decoder")
-    add("--seed", type=int, default=0)
     add("--only", help="one decoder, in this process")
     add("--keep", type=Path, default=Path("runs/mutated"), help="where inputs at fault go")
-    add("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     args.keep = args.keep.resolve()
@@ -457,8 +456,7 @@ def main_trials() -> int:
         for fault in dict.fromkeys(found["faults"]):
             print(fault, flush=True)
     print(f"{sum(x['tried'] for x in account.values())} inputs")
-    if args.json is not None:
-        args.json.write_text(json.dumps(account, indent=1) + "\n")
+    write(args.json, account)
     return int(any(x["faults"] for x in account.values()))
 
 
