@@ -8,7 +8,6 @@ regressor, made with Pinocchio, over the first ten seconds of each path. `make t
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib import resources
 from typing import Any
 
@@ -17,11 +16,9 @@ import pinocchio
 from scipy.linalg import qr
 from trials import Task, columns_of, held_out, learn
 
-from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.model.robots import documented
 from adapter.signals.records import stamp_of
-from sim.scenarios import build
 from tests.helpers.benchmark import options, told
 
 KINDS = ("random", "designed")
@@ -34,9 +31,7 @@ Curve = list[tuple[float, float, float]]
 def curve(seed: int, kind: str, seconds: float) -> tuple[Curve, np.ndarray]:
     """(t, learner's error, least squares' error), shares of the effort limits, rms of all joints;
     and the states' motion."""
-    q, dq, ddq = held_out(seed)
-    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
-    tau = ModelTorque(truth)(q, dq, ddq)
+    q, dq, ddq, tau = held_out(seed)
     rows: Curve = []
     states: list[np.ndarray] = []
     Y: list[np.ndarray] = []

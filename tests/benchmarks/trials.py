@@ -132,8 +132,8 @@ def schema_trial(job: tuple[str, int, str]) -> Row:
     }
 
 
-def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(q, dq, ddq) of a motion that was never learned from."""
+def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(q, dq, ddq) of a motion that was never learned from, and the true torque along it."""
     motion = RandomMotion(
         MotionLimits.of(documented("panda")),
         np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4]),
@@ -144,7 +144,8 @@ def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         motion.advance(0.02)
         rows.append((motion.q.copy(), motion.dq.copy(), motion.ddq.copy()))
     q, dq, ddq = (np.array(column) for column in zip(*rows, strict=True))
-    return q, dq, ddq
+    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
+    return q, dq, ddq, ModelTorque(truth)(q, dq, ddq)
 
 
 def columns_of(theta: Theta, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
@@ -169,9 +170,7 @@ def theta_trial(
     Both are judged by torque, effects included, on a noiseless motion that neither has seen.
     """
     (seed,) = job
-    q, dq, ddq = held_out(seed)
-    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
-    tau = ModelTorque(truth)(q, dq, ddq)
+    q, dq, ddq, tau = held_out(seed)
     Y: list[np.ndarray] = []
     ratios: list[tuple[float, ...]] = []
     lowest = [np.inf]
@@ -218,16 +217,9 @@ def theta_trial(
 
 def can_arm(world: Scenario, seed: int) -> Driver:
     """The arm behind Damiao motors: 16, 12 and 12 bits, replies of the joints one by one."""
-    from drivers.damiao.arm import DamiaoArm
-    from sim.damiao.line import Line
-    from sim.damiao.server import Boards
-    from tests.helpers.can_lockstep import Lockstep
+    from tests.helpers.can_lockstep import on_line
 
-    line = Line()
-    line.attach(Boards(line.boards, world, now_ns=line.now_ns))
-    address, names = "can://line?interface=virtual", world.truth.joint_names
-    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-    return Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
+    return on_line(world)[0]
 
 
 def wire_trial(job: tuple[str, int]) -> Row:
