@@ -233,8 +233,14 @@ def main() -> None:
     args = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     logs = make_logs(args.folder / "logs", args.logs, args.seconds)
-    if args.only is not None:
-        told = only(args.only, logs[: args.compared], args)
+    if args.only is not None:  # one way of doing the work, in this process
+        some, told = logs[: args.compared], {}
+        if args.only == "sysid":
+            told = mujoco_sysid(some)
+        elif args.only == "plain":
+            plain_loop(some)
+        else:
+            timed(some, args.folder / "only", 0)
         print(json.dumps({**of_this_process(), **told}))
         return
     timed(logs[:2], args.folder / "first", 2)  # kernels are compiled
@@ -264,17 +270,6 @@ def main() -> None:
     }
     print(json.dumps(found, indent=1))
     write(args.json, found)
-
-
-def only(name: str, logs: list[str], args: argparse.Namespace) -> dict[str, float]:
-    """One way of doing the work, in this process."""
-    if name == "sysid":
-        return mujoco_sysid(logs)
-    if name == "plain":
-        plain_loop(logs)
-    else:
-        timed(logs, args.folder / "only", 0)
-    return {}
 
 
 if __name__ == "__main__":

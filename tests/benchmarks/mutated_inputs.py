@@ -21,6 +21,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -315,6 +316,13 @@ def commands(folder: Path) -> dict[str, Decoder]:
     csv = b"time,q,dq,tau\n" + b"".join(b"%.3f,1.5,2e-3,-7\n" % (1e-3 * k) for k in range(20))
     columns = ("--columns", "time=0,q=1,dq=2,tau=3", "--to", str(folder / "to.mcap"))
 
+    def answered(*words: str) -> int:
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            code = main(list(words))
+        assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
+        return code
+
     def given(name: str, *words: str) -> Callable[[bytes], object]:
         path = folder / name
 
@@ -322,11 +330,7 @@ def commands(folder: Path) -> dict[str, Decoder]:
             path.write_bytes(data)
             for old in ("to.mcap", "mended.mcap"):
                 (folder / old).unlink(missing_ok=True)
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                code = main([word.replace("FILE", str(path)) for word in words])
-            assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
-            return code
+            return answered(*(word.replace("FILE", str(path)) for word in words))
 
         return run
 
@@ -351,29 +355,18 @@ def commands(folder: Path) -> dict[str, Decoder]:
     results = folder / "results"
     given("x.mcap", "replay", "FILE", "--robot", arm, "--no-report", "--out", str(results))(log)
     good = {path.name: path.read_bytes() for path in results.iterdir() if path.is_file()}
+
+    def reported(name: str, data: bytes) -> int:
+        for other, content in good.items():
+            (results / other).write_bytes(data if other == name else content)
+        return answered("report", str(results))
+
     for name, data in good.items():
-        lines[f"report {name}"] = data, _reported(results, good, name), name.endswith("json")
+        lines[f"report {name}"] = data, partial(reported, name), name.endswith("json")
     return {
         f"adapter {name}": Decoder([seed], run, (), 0.0005, text)
         for name, (seed, run, text) in lines.items()
     }
-
-
-def _reported(results: Path, good: dict[str, bytes], name: str) -> Callable[[bytes], object]:
-    """What makes the page of a run one of whose files was changed."""
-    from adapter.cli.exit_codes import ExitCode
-    from adapter.cli.main import main
-
-    def run(data: bytes) -> int:
-        for other, content in good.items():
-            (results / other).write_bytes(data if other == name else content)
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            code = main(["report", str(results)])
-        assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
-        return code
-
-    return run
 
 
 def everything(folder: Path) -> Iterator[tuple[str, Decoder]]:

@@ -87,16 +87,13 @@ def recorded(seed: int, recipe: Recipe) -> tuple[Log, SelfModel]:
     if ended.fault is not None:
         raise SystemExit(f"seed {seed}: {ended.fault}")
     q, dq, tau = (np.array([getattr(x, name) for x in samples]) for name in ("q", "dq", "tau"))
-    log = Log(Path("rate.mcap"), robot.tree.joint_names, _stamps(samples), q, dq, tau)
+    stamps = np.array([x.stamp_ns for x in samples], dtype=np.int64)
+    log = Log(Path("rate.mcap"), robot.tree.joint_names, stamps, q, dq, tau)
     if links:
         heard = [x.links for x in samples if x.links is not None]
         twists, accels = (np.array([getattr(x, k) for x in heard]) for k in ("twist", "accel"))
         log = replace(log, link_names=robot.tree.body_names, twists=twists, accels=accels)
     return log, robot
-
-
-def _stamps(samples: list[JointSample]) -> np.ndarray:
-    return np.array([x.stamp_ns for x in samples], dtype=np.int64)
 
 
 def least_squares(log: Log, until_s: float, robot: SelfModel) -> Array:

@@ -68,26 +68,21 @@ def parts_of(learner: OnlineLearner, data: TreeData, repeats: int) -> Row:
     states = data.take(slice(0, repeats)).states(first_ns=10**15)
     spare = theta.empty_moments()
 
-    def look(k: int) -> None:
-        schema.updates = 0
+    def gradient(updates: int) -> None:
+        schema.updates = updates
         schema.compute_gradient()
-
-    def glance(k: int) -> None:
-        schema.updates = 1
-        schema.compute_gradient()
-
-    def redo(k: int) -> None:
-        theta.absorb_again(frames, states[k : k + 3], spare)
 
     work: dict[str, Callable[[int], object]] = {
         "moments of λ": lambda k: schema.absorb(states[k : k + 1]),
-        "gradient of λ": glance,
-        "gradient of λ with a look at its curvature (every 20th)": look,
+        "gradient of λ": lambda k: gradient(1),
+        "gradient of λ with a look at its curvature (every 20th)": lambda k: gradient(0),
         "regressor and prediction": lambda k: theta.errors(frames, states[k : k + 1]),
         "regressor, prediction, moments of θ": lambda k: theta.absorb_again(
             frames, states[k : k + 1], spare
         ),
-        "three samples redone (while a rebuild lasts)": redo,
+        "three samples redone (while a rebuild lasts)": lambda k: theta.absorb_again(
+            frames, states[k : k + 3], spare
+        ),
         "gradient of θ": lambda k: theta.compute_gradient(),
         "ADAM on λ and θ": lambda k: learner.adam.step(),
     }

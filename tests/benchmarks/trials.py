@@ -74,11 +74,6 @@ class Task:
     rests: tuple[tuple[float, float], ...] = ()
     arm_of: Callable[[Scenario, int], Driver] | None = None
 
-    def arguments(self) -> list[str]:
-        """Of the command."""
-        run = ["run", "--scenario", self.scenario, "--seed", str(self.seed)]
-        return [*run, "--duration", str(self.duration_s), *self.options]
-
 
 def learn(
     task: Task, look: Callable[[OnlineLearner, np.ndarray], None] = lambda learner, record: None
@@ -87,7 +82,9 @@ def learn(
     import torch
 
     torch.set_num_threads(1)
-    args = build_parser().parse_args(task.arguments())
+    run = ["run", "--scenario", task.scenario, "--seed", str(task.seed)]
+    run += ["--duration", str(task.duration_s), *task.options]
+    args = build_parser().parse_args(run)
     plan = run_plan(args)
     config, robot, world = plan.config, plan.robot, plan.world
     assert world is not None
