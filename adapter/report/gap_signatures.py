@@ -190,7 +190,10 @@ def _over_time(result: GapResult, j: int) -> Panel:
     ax = drawing.axes[0]
     _limits(ax, curves.t, [curves.before[:, j], curves.after[:, j]])
     _noise_band(ax, result.noise_floor_nm[j])
-    _spans(ax, result, j)
+    for finding in result.findings:  # where those begin and end that come or go meanwhile
+        begin, end = finding.interval_s
+        for edge in ([begin] if begin > 0.0 else []) + ([] if finding.lasting else [end]):
+            ax.axvline(edge, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
     ax.plot(*_line(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
     ax.plot(*_line(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
     time_axis(drawing, "time, s")
@@ -202,15 +205,6 @@ def _line(t: Array, y: Array) -> tuple[Array, Array]:
     t, y = thin(t, y)
     breaks = np.flatnonzero(np.diff(t) > LEFT_OUT_S) + 1
     return np.insert(t, breaks, t[breaks]), np.insert(y, breaks, np.nan)
-
-
-def _spans(ax: Axes, result: GapResult, j: int) -> None:
-    """Where effects begin and end, for those that come or go during the recording."""
-    for finding in result.findings:
-        begin, end = finding.interval_s
-        edges = ([begin] if begin > 0.0 else []) + ([] if finding.lasting else [end])
-        for edge in edges:
-            ax.axvline(edge, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
 
 
 def _motion(result: GapResult, j: int) -> Panel:

@@ -55,10 +55,7 @@ class Spoiler:
 
     def due(self, tick: int) -> list[Fault]:
         """The faults that happen once and whose time has come."""
-        if not self._waiting:
-            return []
-        now_s = tick * TICK_S
-        due = [fault for fault in self._waiting if fault.at_s <= now_s]
+        due = [fault for fault in self._waiting if fault.at_s <= tick * TICK_S]
         for fault in due:
             self._waiting.remove(fault)
             self.counts[fault.name] += 1
