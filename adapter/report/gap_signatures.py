@@ -11,7 +11,7 @@ import numpy as np
 
 from adapter.effects.catalogue import KNOWN
 from adapter.effects.law import OverSignals
-from adapter.gap.result import Finding, GapResult, Leftover, RolloutCurves
+from adapter.gap.result import Finding, GapResult, RolloutCurves
 from adapter.gap.words import signal_words
 from adapter.model.numbers import plain
 from adapter.model.spatial import Array
@@ -265,20 +265,17 @@ def _window(rollout: RolloutCurves, j: int) -> tuple[float, float]:
 
 def unexplained_panels(result: GapResult) -> list[Panel]:
     """What is left against the signal that it follows most, one panel each."""
-    if not result.curves:
-        return []
-    return [_leftover(result, item) for item in result.unexplained]
-
-
-def _leftover(result: GapResult, item: Leftover) -> Panel:
-    name = item.depends_on[0] if item.depends_on else "t"
-    x = _signal(result, name)
-    if x is None:
-        name, x = "t", np.concatenate([c.t for c in result.curves])
-    label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
-    drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
-    note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
-    return drawing.panel(f"Left on joint {item.joint}", "N m", note)
+    panels = []
+    for item in result.unexplained if result.curves else ():
+        name = item.depends_on[0] if item.depends_on else "t"
+        x = _signal(result, name)
+        if x is None:
+            name, x = "t", np.concatenate([c.t for c in result.curves])
+        label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
+        drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
+        note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
+        panels.append(drawing.panel(f"Left on joint {item.joint}", "N m", note))
+    return panels
 
 
 def _signal(result: GapResult, name: str) -> Array | None:
