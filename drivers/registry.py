@@ -100,5 +100,4 @@ def joint_count(address: str) -> int | None:
 def _load(target: str) -> Callable[..., Any]:
     """What "MODULE:NAME" names; the module relative to this package, whatever that is called."""
     module, _, name = target.partition(":")
-    found: Callable[..., Any] = getattr(import_module(module, __package__), name)
-    return found
+    return getattr(import_module(module, __package__), name)

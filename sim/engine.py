@@ -69,7 +69,6 @@ class Engine:
     def __init__(
         self,
         truth: Truth,
-        period_s: float = PERIOD_S,
         substeps: int = SUBSTEPS,
         end_stops: bool = False,
     ) -> None:
@@ -77,15 +76,14 @@ class Engine:
 
         Args:
             truth: arm and effects; those of the sensors are not this class's business.
-            period_s: of a tick.
             substeps: of a tick.
             end_stops: whether joints have springs at the ends of their ranges.
 
         Raises:
             ValueError: a body that cannot be simulated.
         """
-        self._n, self._period_s, self._substeps = truth.n, period_s, substeps
-        self._h = period_s / substeps
+        self._n, self._substeps = truth.n, substeps
+        self._h = PERIOD_S / substeps
         self._joints, self._rest = list(range(truth.n)), np.zeros(truth.n)
         self._lower = truth.limits.lower if end_stops else np.full(truth.n, -np.inf)
         self._upper = truth.limits.upper if end_stops else np.full(truth.n, np.inf)
@@ -102,7 +100,7 @@ class Engine:
         self._stages: list[ArmClient] = []
         clients: list[int] = []
         self._close = weakref.finalize(self, disconnect, clients)
-        for start_s, rigid in rigid_truths(truth, period_s):
+        for start_s, rigid in rigid_truths(truth, PERIOD_S):
             self._stages.append(load(start_s, rigid, self._h))
             clients.append(self._stages[-1].client)
         self._ticks, self._start_s = 0, 0.0
@@ -156,7 +154,7 @@ class Engine:
         for i in range(self._substeps):
             part = (i + 0.5) / self._substeps
             ff = law.ff0 + part * (law.ff1 - law.ff0)
-            rigid = self._reaching(t + part * self._period_s, stored, dq, law, ff, ahead)
+            rigid = self._reaching(t + part * PERIOD_S, stored, dq, law, ff, ahead)
             bullet.setJointMotorControlArray(
                 stage.arm,
                 self._joints,
@@ -172,7 +170,7 @@ class Engine:
             stored, speed = both[:, 0].copy(), both[:, 1].copy()
             if len(self._bent):
                 bend(self._rows, (dq + speed) / 2, h, self._bent)
-            self._ddq, dq = (speed - dq) / (self._period_s if free else h), speed
+            self._ddq, dq = (speed - dq) / (PERIOD_S if free else h), speed
         self._q, self._dq = stored - h / 2 * dq, dq
         self._ticks += 1
 
@@ -195,7 +193,7 @@ class Engine:
         self._close()
 
     def _now(self) -> float:
-        return self._start_s + self._ticks * self._period_s
+        return self._start_s + self._ticks * PERIOD_S
 
     def _due(self) -> ArmClient:
         """The stage of the tick that starts now."""

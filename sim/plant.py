@@ -167,21 +167,17 @@ class Plant:
         """One tick, but for the first sample, which is the start itself; then the sensors."""
         self._k += 1
         if self._k > 0:
-            self._move_on()
+            self._age += 1
+            if self._age > REFRESH_TICKS:
+                self.stop()
+            end = self._brake() if self.braked else self._wanted
+            self._engine.tick(self._drive, end)
+            self._drive = end
+            self._q, self._dq = self._engine.state()
+            self._watch()
         if self._sensors is not None:
             now_s = self._k * PERIOD_S
             self._seen = self._sensors.read(now_s, self._q, self._dq, self._drive)
-
-    def _move_on(self) -> None:
-        """One tick of the arm itself."""
-        self._age += 1
-        if self._age > REFRESH_TICKS:
-            self.stop()
-        end = self._brake() if self.braked else self._wanted
-        self._engine.tick(self._drive, end)
-        self._drive = end
-        self._q, self._dq = self._engine.state()
-        self._watch()
 
     def _brake(self) -> Array:
         """Driving torque (n,) at the end of the next tick that slows down and then holds."""

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adapter.gap.servo_fit import (
     DELAY,
@@ -38,14 +37,13 @@ LEAST_DELAY_S = 1e-5  # standard deviation of one joint's, at least
 DOCUMENTED_DELAY_S = 5e-5  # the same of a delay
 SHOWN = 2.0  # from zero, where nobody documented a value: every servo has some of it
 TIE_CHI2 = 4.0  # by which an effect must foretell blocks that its fit has not seen better
-BLOCK_S, FITTED_SHARE = (
-    2.0,
-    2.0 / 3.0,
-)  # of alternating blocks; of a recording, without held-out ones
+BLOCK_S = 2.0  # of alternating blocks
+FITTED_SHARE = 2.0 / 3.0  # of a recording, where none is held out
 DRAWS = 8  # of inertias as wrong as the documentation may be
 OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
+ALL_FREE = Freedom(np.ones(PARAMETERS, dtype=bool), np.zeros(PARAMETERS))
 
 UNITS = {
     "servo_position_gain": ("kp", "N m/rad"),
@@ -224,15 +222,10 @@ def _track(log: Log, names: tuple[str, ...]) -> Track:
     return track
 
 
-def _everything() -> NDArray[np.bool_]:
-    return np.ones(PARAMETERS, dtype=bool)
-
-
 def _rough(arm: _Arm) -> list[JointFit]:
     """All numbers of all joints, the load being that of the motion as it was measured."""
-    free = Freedom(_everything(), np.zeros(PARAMETERS))
     tasks = arm.tasks([track.smooth for track in arm.tracks])
-    return [fit_joint(task, free, first_guess(task)) for task in tasks]
+    return [fit_joint(task, ALL_FREE, first_guess(task)) for task in tasks]
 
 
 def _motions(arm: _Arm, fits: Sequence[JointFit]) -> list[Array]:
@@ -265,8 +258,7 @@ def _with_lead(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     without = []
     for fit, x in zip(fits, start, strict=True):
         x[DAMPING] = max(fit.x[DAMPING] - fit.x[LEAD], 0.0)
-        freedom = Freedom(_everything(), np.zeros(PARAMETERS)).without(LEAD)
-        without.append(fit_joint(fit.task, freedom, x))
+        without.append(fit_joint(fit.task, ALL_FREE.without(LEAD), x))
     pays = sum(_paid(fit, other) for fit, other in zip(fits, without, strict=True))
     return list(fits) if told or pays > TIE_CHI2 * len(fits) else without
 
@@ -299,22 +291,18 @@ def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     return found
 
 
-def _blocks(task: JointTask, part: int) -> list[NDArray[np.bool_]]:
-    """Every second block of time."""
-    found = []
-    for track, rows in zip(task.tracks, task.rows, strict=True):
-        found.append(rows & ((track.stamp_s // BLOCK_S).astype(int) % 2 == part))
-    return found
+def _blocks(task: JointTask, part: int) -> JointTask:
+    """On every second block of time."""
+    pairs = zip(task.tracks, task.rows, strict=True)
+    rows = [take & ((track.stamp_s // BLOCK_S).astype(int) % 2 == part) for track, take in pairs]
+    return replace(task, rows=rows)
 
 
 def _paid(fit: JointFit, without: JointFit) -> float:
     """By how much a fit foretells blocks it has not seen better than another, in chi squared."""
     gain = 0.0
     for part in (0, 1):
-        seen, unseen = (
-            fit.task.on(_blocks(fit.task, part)),
-            fit.task.on(_blocks(fit.task, 1 - part)),
-        )
+        seen, unseen = _blocks(fit.task, part), _blocks(fit.task, 1 - part)
         errors = [
             JointFit(unseen, f.freedom, fit_joint(seen, f.freedom, f.x).x).error()
             for f in (without, fit)
@@ -414,7 +402,7 @@ def _scored(
     for fit in fits:
         pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
         rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
-        fitted.append(fit_joint(fit.task.on(rows), fit.freedom, fit.x))
+        fitted.append(fit_joint(replace(fit.task, rows=rows), fit.freedom, fit.x))
     part = _servos(arm, fitted) if fitted else servos
     errors = []
     for s in (arm.documented, part):

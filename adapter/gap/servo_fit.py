@@ -6,7 +6,7 @@ then all joints together, whose motion, free of noise, gives the load for a seco
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -56,14 +56,6 @@ class JointTask:
         """What they leave of the readings that are fitted, rad."""
         rows = zip(self.left(x), self.rows, strict=True)
         return np.concatenate([left[take] for left, take in rows])
-
-    def on(self, rows: Sequence[NDArray[np.bool_]]) -> JointTask:
-        """The same on other readings."""
-        return replace(self, rows=rows)
-
-    def under(self, loads: Sequence[Load]) -> JointTask:
-        """The same under other loads."""
-        return replace(self, loads=loads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +143,8 @@ class JointFit:
         """(s, f) by how much the parameters over their scales would move under other loads."""
         here = self.task.fitted(self.x)
         gain = -self.noise_covariance @ self.jacobian.T / self.unit
-        return np.array([gain @ (self.task.under(o).fitted(self.x) - here) for o in others])
+        moved = (replace(self.task, loads=loads) for loads in others)
+        return np.array([gain @ (task.fitted(self.x) - here) for task in moved])
 
     def error(self) -> float:
         """Sum of squares over the readings that its task fits, rad²."""
@@ -193,9 +186,9 @@ def _slopes(task: JointTask, freedom: Freedom, part: Array, scale: Array) -> Arr
 def first_guess(task: JointTask) -> Array:
     """(6,) by equation error on smooth signals, the delay by trying."""
     best, least, pairs = np.zeros(PARAMETERS), np.inf, zip(task.tracks, task.loads, strict=True)
-    sides = [_sides(track, load, task.joint) for track, load in pairs]
+    sides = [_equation(track, load, task.joint) for track, load in pairs]
     for delay in np.arange(0.0, LATEST_S, EVERY_S):
-        rows = [side.at(delay) for side in sides]
+        rows = [side(delay) for side in sides]
         matrix, wanted = (np.concatenate(part) for part in zip(*rows, strict=True))
         size = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-12)
         x, left = nnls(matrix / size, wanted)
@@ -204,27 +197,8 @@ def first_guess(task: JointTask) -> Array:
     return best
 
 
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    """Both sides of a servo's equation, every 5 ms, but for the delay."""
-
-    t: Array
-    goal: Array
-    rate: Array
-    grid: Array
-    q: Array
-    matrix: Array
-
-    def at(self, delay: float) -> tuple[Array, Array]:
-        """Columns (m, 5) and what they are to add up to (m,)."""
-        command = np.interp(self.t - delay, self.grid, self.goal)
-        lead = -np.interp(self.t - delay, self.grid, self.rate)
-        matrix = self.matrix.copy()
-        matrix[:, LEAD] = lead
-        return matrix, command - self.q
-
-
-def _sides(track: Track, load: Load, joint: int) -> _Sides:
+def _equation(track: Track, load: Load, joint: int) -> Callable[[float], tuple[Array, Array]]:
+    """Of a servo, every 5 ms, by its delay: columns (m, 5) and what they are to add up to (m,)."""
     period = float(np.median(np.diff(track.stamp_s)))
     one = track.only(joint)
     command = smoothed(one.goal(np.zeros(1), 0.0), track.step_s, period)[:2, :, 0]
@@ -235,4 +209,11 @@ def _sides(track: Track, load: Load, joint: int) -> _Sides:
     middle = track.t - 0.5 * track.step_s
     edge = (middle > 0.5) & (middle < middle[-1] - 0.3)
     take = np.flatnonzero(edge)[:: max(round(5e-3 / track.step_s), 1)]
-    return _Sides(middle[take], command[0], command[1], middle, q[take], matrix[take])
+
+    def at(delay: float) -> tuple[Array, Array]:
+        goal, rate = (np.interp(middle[take] - delay, middle, row) for row in command)
+        columns = matrix[take]
+        columns[:, LEAD] = -rate
+        return columns, goal - q[take]
+
+    return at

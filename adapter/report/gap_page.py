@@ -195,25 +195,22 @@ def gap_checks(result: GapResult) -> list[Check]:
     """All that the result allows; nothing where nothing could be told."""
     if result.problem is not None:
         return []
-    checks = [_evidence(result), _rivals(result), _scored(result), _left(result)]
+    checks = [_evidence(result), _rivals(result)] if result.findings else []
+    checks += [_scored(result), _left(result)]
     checks += [Check(BAD, "Contradiction", text) for text in result.contradictions]
     if result.stopped_after_rounds:
         checks.append(Check(LOOK, "The search", stopped(result)))
-    return [check for check in checks if check is not None]
+    return checks
 
 
-def _evidence(result: GapResult) -> Check | None:
-    if not result.findings:
-        return None
+def _evidence(result: GapResult) -> Check:
     least = min(result.findings, key=lambda f: f.evidence)
     called = f"{least.title}, {who(least.effect, least.joints)}"
     said = f"the least sure of {len(result.findings)}: {called}, {percent(least.evidence)}"
     return Check(GOOD if least.evidence >= SURE else LOOK, "How sure", said)
 
 
-def _rivals(result: GapResult) -> Check | None:
-    if not result.findings:
-        return None
+def _rivals(result: GapResult) -> Check:
     rows = rival_rows(result)
     if not rows:
         said = "no other effect of the catalogue explains 90 % of any of these on these data"

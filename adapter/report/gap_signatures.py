@@ -11,7 +11,7 @@ import numpy as np
 
 from adapter.effects.catalogue import KNOWN
 from adapter.effects.law import OverSignals
-from adapter.gap.result import Finding, GapResult, Leftover, RolloutCurves
+from adapter.gap.result import Finding, GapResult, RolloutCurves
 from adapter.gap.words import signal_words
 from adapter.model.numbers import plain
 from adapter.model.spatial import Array
@@ -190,7 +190,10 @@ def _over_time(result: GapResult, j: int) -> Panel:
     ax = drawing.axes[0]
     _limits(ax, curves.t, [curves.before[:, j], curves.after[:, j]])
     _noise_band(ax, result.noise_floor_nm[j])
-    _spans(ax, result, j)
+    for finding in result.findings:  # where those begin and end that come or go meanwhile
+        begin, end = finding.interval_s
+        for edge in ([begin] if begin > 0.0 else []) + ([] if finding.lasting else [end]):
+            ax.axvline(edge, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
     ax.plot(*_line(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
     ax.plot(*_line(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
     time_axis(drawing, "time, s")
@@ -202,15 +205,6 @@ def _line(t: Array, y: Array) -> tuple[Array, Array]:
     t, y = thin(t, y)
     breaks = np.flatnonzero(np.diff(t) > LEFT_OUT_S) + 1
     return np.insert(t, breaks, t[breaks]), np.insert(y, breaks, np.nan)
-
-
-def _spans(ax: Axes, result: GapResult, j: int) -> None:
-    """Where effects begin and end, for those that come or go during the recording."""
-    for finding in result.findings:
-        begin, end = finding.interval_s
-        edges = ([begin] if begin > 0.0 else []) + ([] if finding.lasting else [end])
-        for edge in edges:
-            ax.axvline(edge, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
 
 
 def _motion(result: GapResult, j: int) -> Panel:
@@ -271,20 +265,17 @@ def _window(rollout: RolloutCurves, j: int) -> tuple[float, float]:
 
 def unexplained_panels(result: GapResult) -> list[Panel]:
     """What is left against the signal that it follows most, one panel each."""
-    if not result.curves:
-        return []
-    return [_leftover(result, item) for item in result.unexplained]
-
-
-def _leftover(result: GapResult, item: Leftover) -> Panel:
-    name = item.depends_on[0] if item.depends_on else "t"
-    x = _signal(result, name)
-    if x is None:
-        name, x = "t", np.concatenate([c.t for c in result.curves])
-    label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
-    drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
-    note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
-    return drawing.panel(f"Left on joint {item.joint}", "N m", note)
+    panels = []
+    for item in result.unexplained if result.curves else ():
+        name = item.depends_on[0] if item.depends_on else "t"
+        x = _signal(result, name)
+        if x is None:
+            name, x = "t", np.concatenate([c.t for c in result.curves])
+        label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
+        drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
+        note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
+        panels.append(drawing.panel(f"Left on joint {item.joint}", "N m", note))
+    return panels
 
 
 def _signal(result: GapResult, name: str) -> Array | None:

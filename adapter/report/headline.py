@@ -29,23 +29,12 @@ MANY_LOADS = 3
 def headline(data: RunData, worth: Worth) -> list[str]:
     """At most a handful of short sentences, what is worth most first."""
     if why := refusal(data.figures):
-        said = f"Nothing was learned, since the torques are not those of this arm: {why}"
-        return [said, *_trouble(data.figures), *_late(data.figures)]
-    found = [
-        *_tracking(worth),
-        *_torque(data, worth),
-        *_loads(data, worth),
-        *_hand(data, worth),
-        *_trouble(data.figures),
-    ]
-    return [*found, *_late(data.figures)]
-
-
-def _late(figures: Mapping[str, Any]) -> list[str]:
-    """Whether deadlines were missed, and by whose fault."""
-    if not is_live(figures):
-        return []
-    return [f"{capital(missed_words(figures))}."]
+        found = [f"Nothing was learned, since the torques are not those of this arm: {why}"]
+    else:
+        found = [*_tracking(worth), *_torque(data, worth), *_loads(data, worth)]
+        found += _hand(data, worth)
+    late = [f"{capital(missed_words(data.figures))}."] if is_live(data.figures) else []
+    return [*found, *_trouble(data.figures), *late]
 
 
 def against(figures: Mapping[str, Any]) -> str:

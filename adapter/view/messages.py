@@ -184,8 +184,7 @@ class Messages:
             "refused": news.get("refused", 0),
             "lines": now.view.lines,
         }
-        plain: Message = json_ready(told)
-        return plain
+        return json_ready(told)
 
     def _times(self, now: Now) -> Message:
         timing, lately = now.view.timing, now.lately
@@ -202,8 +201,7 @@ class Messages:
                 "p50_lately": late.percentile_us(50.0),
                 "p99_lately": late.percentile_us(99.0),
             }
-        plain: Message = json_ready(told)
-        return plain
+        return json_ready(told)
 
 
 def _finding(found: Mapping[str, Any]) -> Message:

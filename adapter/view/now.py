@@ -127,13 +127,12 @@ class Residual:
         self._version, self._ready = 0, False
         self._last, self._power, self._stamp_ns = np.full(n, np.nan), np.full(n, np.nan), 0
 
-    def follow(self, snapshot: Snapshot, learning: bool) -> None:
-        """Go on with an estimate; `learning`: whether θ is being learned."""
-        if snapshot.version == self._version or not learning:
+    def follow(self, snapshot: Snapshot) -> None:
+        """Go on with an estimate, once θ is being learned."""
+        if snapshot.version == self._version:
             return
         self._version = snapshot.version
-        numbers = snapshot.lam, snapshot.theta
-        if all(np.isfinite(x).all() for x in numbers):
+        if np.isfinite(snapshot.lam).all() and np.isfinite(snapshot.theta).all():
             effects = np.nan_to_num(snapshot.effects)
             self._model.set(
                 snapshot.lam, snapshot.theta + self._tool, effects, snapshot.effect_shapes
@@ -183,7 +182,7 @@ class Onlooker:
         learning, n = bool(news.get("theta_started")), len(self._last[0])
         noise = np.full(n, np.nan)
         if snapshot is not None and learning:
-            self._residual.follow(snapshot, learning)
+            self._residual.follow(snapshot)
             noise = snapshot.torque_std
         residual, rms = self._residual.take(view.records)
         lam, theta = states_of(view, learning)
@@ -242,8 +241,7 @@ class Onlooker:
         """(n, 10) bool: parameters of θ that torques show without those of other links."""
         arm = self.known.documented
         basis = base_parameters(arm.tree, arm.lam, arm.gravity).basis
-        share: np.ndarray = np.einsum("ab,ab->a", basis, basis).reshape(-1, 10) > SHOWN_ALONE
-        return share
+        return np.einsum("ab,ab->a", basis, basis).reshape(-1, 10) > SHOWN_ALONE
 
 
 def learned_frames(documented: SelfModel, snapshot: Snapshot) -> LearnedFrames:

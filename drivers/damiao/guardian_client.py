@@ -98,16 +98,12 @@ class GuardianClient:
             time.sleep(0.005)
         return former
 
-    def release(self) -> None:
-        """Send it away: there is nothing to hold."""
-        self.memory.mode = GuardianMode.RELEASED
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(RELIEF_TIMEOUT_S)
-
     def leave(self) -> None:
         """Let it go on alone with what it was told last; away with it where that was nothing."""
         if self.memory.mode == GuardianMode.IDLE:
-            self.release()
+            self.memory.mode = GuardianMode.RELEASED
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(RELIEF_TIMEOUT_S)
         if self.alive:
             self._process.returncode = 0  # it is meant to outlive us: nobody waits for it
 

@@ -215,26 +215,21 @@ class FciArm:
         """The first state, after a recovery where that was asked for. Raises DriverError."""
         state = _next_of(stream)
         if state.status.robot_mode == tables.ROBOT_REFLEX and self._target.recover:
-            state = self._recovered(stream, state)
+            assert self._connection is not None
+            recover(self._connection)
+            deadline = time.monotonic() + RECOVERED_S
+            while state.status.robot_mode in _RECOVERING_MODES:
+                if time.monotonic() > deadline:
+                    raise NotReady(
+                        f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
+                        "that it recovered, but does not show it"
+                    )
+                self.intake.refused[Refusal.RECOVERING] += 1
+                state = _next_of(stream)
         self._note_status(state.status)
         mode = state.status.robot_mode
         if self.can_move and mode != tables.ROBOT_IDLE:
             raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
-        return state
-
-    def _recovered(self, stream: StateStream, first: State) -> State:
-        """The first state that shows no reflex any more. Raises DriverError."""
-        assert self._connection is not None
-        recover(self._connection)
-        state, deadline = first, time.monotonic() + RECOVERED_S
-        while state.status.robot_mode in _RECOVERING_MODES:
-            if time.monotonic() > deadline:
-                raise NotReady(
-                    f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
-                    "that it recovered, but does not show it"
-                )
-            self.intake.refused[Refusal.RECOVERING] += 1
-            state = _next_of(stream)
         return state
 
     def _state_while_stopping(self, wait_s: float) -> State | None:

@@ -120,8 +120,7 @@ def _offset(dtype: np.dtype[np.void], name: str) -> int:
 
 def id_at(data: memoryview, start: int) -> int:
     """Message id of the state that begins there."""
-    message_id: int = _ID.unpack_from(data, start)[0]
-    return message_id
+    return _ID.unpack_from(data, start)[0]
 
 
 class Status(NamedTuple):
@@ -283,8 +282,7 @@ def connect_reply(payload: bytes) -> tuple[int, int]:
             f"an answer to Connect of {HEADER.size + len(payload)} bytes; it has "
             f"{HEADER.size + _CONNECT_REPLY.size}"
         )
-    status, version = _CONNECT_REPLY.unpack_from(payload)
-    return status, version
+    return _CONNECT_REPLY.unpack_from(payload)
 
 
 def status_reply(payload: bytes) -> int:

@@ -177,8 +177,7 @@ class ReaderClient:
         if self._taken == self._head and not self._more(wait_s):
             return None
         start = reader.FIRST_SLOT + self._taken % SLOTS * self._step
-        length: int = RECORD.unpack_from(self._map, start)[2]
-        return length
+        return RECORD.unpack_from(self._map, start)[2]
 
     def newest(self) -> int | None:
         """Start of the newest datagram that waits in `data`, of right length; None without."""

@@ -103,8 +103,7 @@ class _Cursor:
         return start
 
     def count(self) -> int:
-        number: int = self._u32(self._data, self._advance(4, 4))[0]
-        return number
+        return self._u32(self._data, self._advance(4, 4))[0]
 
     def text(self) -> str:
         size = self.count()

@@ -227,10 +227,7 @@ def _member(kind: str, fields: dict[str, str]) -> Any:
     base, bracket, size = kind.removesuffix("]").partition("[")
     base = _ALIASES.get(base, base)
     plain: dict[str, Any] = {"string": str, "bool": bool}
-    if base in fields:
-        one = _struct(base, fields)
-    else:
-        one = plain[base] if base in plain else getattr(types, base)
+    one = _struct(base, fields) if base in fields else plain.get(base) or getattr(types, base)
     if not bracket:
         return one
     return types.array[one, int(size)] if size else types.sequence[one]

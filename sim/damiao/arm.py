@@ -51,10 +51,7 @@ class World:
             self._noise = SensorNoise(levels, truth.n, seed)
         zero = np.zeros(truth.n)
         self._quiet = JointSample(0, zero, zero, zero)
-        self._place(np.array(truth.ready if q0 is None else q0, dtype=float))
-
-    def _place(self, q: Array) -> None:
-        zero = np.zeros(self._n)
+        q = np.array(truth.ready if q0 is None else q0, dtype=float)
         self._engine.place(q, zero)
         self._law = DriveLaw(q, zero, zero, zero, zero, zero, zero)
         self._engine.drive(self._law)  # whatever is set up on first use is set up before the clock

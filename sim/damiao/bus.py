@@ -25,6 +25,8 @@ INTERFACES = ("udp_multicast", "socketcan")
 MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
 MULTICAST_PORT = 43113  # python-can's default port
 ASK_S = 0.2
+PACKED = ("timestamp", "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame",
+          "channel", "dlc", "data", "is_fd", "bitrate_switch", "error_state_indicator")  # fmt: skip
 
 
 class BoardsMulticastBus(UdpMulticastBus):
@@ -82,23 +84,9 @@ class BoardsMulticastBus(UdpMulticastBus):
 
 def _packed(message: can.Message) -> bytes:
     """A frame as python-can's buses put it into a datagram."""
-    return bytes(
-        msgpack.packb(
-            {
-                "timestamp": 0.0,
-                "arbitration_id": message.arbitration_id,
-                "is_extended_id": message.is_extended_id,
-                "is_remote_frame": message.is_remote_frame,
-                "is_error_frame": message.is_error_frame,
-                "channel": None,
-                "dlc": message.dlc,
-                "data": bytes(message.data),
-                "is_fd": message.is_fd,
-                "bitrate_switch": message.bitrate_switch,
-                "error_state_indicator": message.error_state_indicator,
-            }
-        )
-    )
+    told = {name: getattr(message, name) for name in PACKED}  # in this order
+    told |= {"timestamp": 0.0, "channel": None, "data": bytes(message.data)}
+    return bytes(msgpack.packb(told))
 
 
 def _unpacked(data: bytes) -> can.Message:
@@ -129,7 +117,12 @@ def open_bus(
     try:
         if interface == "socketcan":
             return can.Bus(interface=interface, channel=channel, fd=fd)
-        _check_group(channel)
+        try:
+            group = ipaddress.ip_address(channel)
+        except ValueError:
+            group = None
+        if group is None or not group.is_multicast:
+            raise ValueError(f"'{channel}' is no multicast address; try {MULTICAST_GROUP}")
         return BoardsMulticastBus(channel, port, fd)
     except (can.CanError, OSError) as error:
         raise ValueError(_advice(interface, channel, error)) from error
@@ -154,15 +147,6 @@ def check_alone(bus: can.BusABC, motor_id: int, reply_id: int, fd: bool) -> None
                 f"another arm answers as motor {motor_id} on this bus; stop it or choose another "
                 "channel or port"
             )
-
-
-def _check_group(channel: str) -> None:
-    try:
-        group = ipaddress.ip_address(channel)
-    except ValueError:
-        group = None
-    if group is None or not group.is_multicast:
-        raise ValueError(f"'{channel}' is no multicast address; try {MULTICAST_GROUP}")
 
 
 def _advice(interface: str, channel: str, error: Exception) -> str:

@@ -194,24 +194,17 @@ class Line:
     def __init__(
         self,
         fd: bool = True,
-        bitrate: int = BITRATE,
-        data_bitrate: int = DATA_BITRATE,
-        epoch_s: float = 0.0,
         faults: Faults | None = None,
     ) -> None:
         """Lay the line.
 
         Args:
             fd: whether FD frames may be sent.
-            bitrate: bit/s of classic frames and arbitration.
-            data_bitrate: bit/s of FD data.
-            epoch_s: added to the clock where it becomes a frame's timestamp (end of the frame).
             faults: the boards' own; `enobufs` strikes the host's sends.
         """
         self.host, self.boards = LineEnd(self, "host", fd), LineEnd(self, "motors", fd)
         self.start_ns, self.busy_ns = START_NS, 0
-        self._fd, self._rates = fd, (bitrate, data_bitrate)
-        self._epoch_s, self._faults = epoch_s, faults
+        self._fd, self._faults = fd, faults
         self._now_ns = self._free_ns = START_NS
         self._node: Node | None = None
         self._from_host: deque[tuple[int, can.Message]] = deque()
@@ -317,7 +310,7 @@ class Line:
         else:
             message, to = waiting.pop(index)[3], self.host
             heapq.heapify(waiting)
-        took = frame_ns(message, *self._rates)
+        took = frame_ns(message, BITRATE, DATA_BITRATE)
         self.busy_ns += took
         self._flying = now + took, to, message
 
@@ -325,7 +318,7 @@ class Line:
         """A frame is complete."""
         self._flying = None
         self._now_ns = self._free_ns = end_ns
-        message.timestamp = self._epoch_s + end_ns * 1e-9
+        message.timestamp = end_ns * 1e-9  # of the frame's end
         to.arrive(message)
         if to is self.boards and self._node is not None:
             self._node.service()

@@ -267,7 +267,10 @@ def data_set(
         raise ValueError("trajectories and processes must be 1 or more")
     place = cache_folder() if folder is None else Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    _sweep(place)
+    for left in place.glob(f"*{PART}"):  # of a killed run; nobody writes at one file for so long
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - left.stat().st_mtime > ABANDONED_S:
+                left.unlink()
     levels = (TreeNoise() if noise else None) if isinstance(noise, bool) else noise
     key = _key(robot, flight)
     jobs = tuple(
@@ -299,14 +302,6 @@ def _key(truth: TreeTruth, flight: Flight) -> str:
         "run": [flight.seconds, flight.rate_hz, flight.seed],
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _sweep(place: Path) -> None:
-    """Remove what a killed run left behind; nobody writes at one file for so long."""
-    for left in place.glob(f"*{PART}"):
-        with contextlib.suppress(FileNotFoundError):
-            if time.time() - left.stat().st_mtime > ABANDONED_S:
-                left.unlink()
 
 
 def _sound(path: Path) -> bool:

@@ -309,20 +309,14 @@ def babble(
         bases[m] = fall.base()
     finally:
         fall.close()
-    _check_range(truth, q)
-    return fall.record(q, dq, tau, bases)
-
-
-def _check_range(truth: TreeTruth, q: Array) -> None:
-    """Refuse a motion q (m, n) that is not inside the limits; NaN is not."""
-    limits = truth.limits
-    inside = np.all((q >= limits.lower) & (q <= limits.upper), axis=0)
+    inside = np.all((q >= truth.limits.lower) & (q <= truth.limits.upper), axis=0)  # NaN is not
     if not inside.all():
         names = ", ".join(np.asarray(truth.joint_names)[~inside])
         raise RuntimeError(
             f"{truth.name}: the feedback did not keep {names} in range; babble more slowly "
             "(high_hz, top_speed) or over a smaller share of the range"
         )
+    return fall.record(q, dq, tau, bases)
 
 
 def _urdf(truth: TreeTruth) -> str:

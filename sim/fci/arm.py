@@ -112,8 +112,7 @@ class Arm:
     def _spring(self, pose: Array, twist: Array, stiffness: Array) -> tuple[Array, Array]:
         error, rate = difference(self.pose, pose), twist - self.jacobian @ self.dq
         M = self.mass(self.q)
-        tau, rest = impedance(M, self.jacobian, error, rate, stiffness, FASTEST_RATE)
-        return tau, rest
+        return impedance(M, self.jacobian, error, rate, stiffness, FASTEST_RATE)
 
     def brake(self) -> None:
         """Slow down and hold."""
@@ -151,16 +150,14 @@ class Arm:
 
     def frame(self, q: Array) -> tuple[Array, Array]:
         """Pose (4, 4) of the end effector and Jacobian (6, 7) at a posture."""
-        pose, J = end_effector(self.truth.frames, q, self._tool)
-        return pose, J
+        return end_effector(self.truth.frames, q, self._tool)
 
     def reach(self, q: Array, pose: Array, elbow: float) -> tuple[Array, float]:
         """The joints (7,) nearest to q that bring the end effector to a pose, and what they miss.
 
         `elbow`, rad, is what joint 3 shall be; NaN for anything.
         """
-        found, missed = posture(self.truth.frames, self._tool, q, np.ascontiguousarray(pose), elbow)
-        return found, missed
+        return posture(self.truth.frames, self._tool, q, np.ascontiguousarray(pose), elbow)
 
     def close(self) -> None:
         """Free the simulator."""

@@ -34,6 +34,7 @@ LATEST_TICKS = 5
 FLIPPED_BYTES = 8  # at most
 SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
 JUMP_RAD = 0.05
+OF_DATAGRAMS = ("drop", "late", "repeat", "reorder", "corrupt")
 AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
 
 
@@ -55,10 +56,7 @@ class Spoiler:
 
     def due(self, tick: int) -> list[Fault]:
         """The faults that happen once and whose time has come."""
-        if not self._waiting:
-            return []
-        now_s = tick * TICK_S
-        due = [fault for fault in self._waiting if fault.at_s <= now_s]
+        due = [fault for fault in self._waiting if fault.at_s <= tick * TICK_S]
         for fault in due:
             self._waiting.remove(fault)
             self.counts[fault.name] += 1
@@ -106,11 +104,8 @@ class Spoiler:
         """One datagram through the network."""
         copies = [data]
         for fault in self._lasting:
-            if fault.at_s > tick * TICK_S or not copies:
-                continue
-            if fault.name not in ("drop", "late", "repeat", "reorder", "corrupt"):
-                continue
-            if not self._happens(fault):
+            waits = fault.at_s > tick * TICK_S or fault.name not in OF_DATAGRAMS
+            if waits or not copies or not self._happens(fault):
                 continue
             if fault.name == "repeat":
                 copies = copies * 2

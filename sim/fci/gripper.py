@@ -202,11 +202,8 @@ class GripperServer:
         self._held += data
         while self._tcp is not None and len(self._held) >= HEADER.size:
             command, ident, size = HEADER.unpack_from(self._held)
-            if command not in PAYLOADS:
-                self._drop()
-                return
-            payload = struct.Struct(PAYLOADS[command])
-            if size != HEADER.size + payload.size:
+            payload = struct.Struct(PAYLOADS[command]) if command in PAYLOADS else None
+            if payload is None or size != HEADER.size + payload.size:
                 self._drop()
                 return
             if len(self._held) < size:

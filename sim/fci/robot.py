@@ -103,7 +103,10 @@ class Robot:
             self._watch()
         if self.motion is None:
             self.q_desired = self.arm.q
-        self._wait_for_operator()
+        if self.mode == RobotMode.USER_STOPPED:
+            self._user_stop_left -= 1
+            if self._user_stop_left <= 0:
+                self.mode = RobotMode.REFLEX if self.errors.any() else RobotMode.IDLE
         self._finish_recovery()
 
     def trip(self, *names: str) -> None:
@@ -175,13 +178,6 @@ class Robot:
             self.joint_collision[:], self.cartesian_collision[:] = 0.0, 0.0
         self._replies.append(reply(self._recovery, status, self.version))
         self._recovery = None
-
-    def _wait_for_operator(self) -> None:
-        if self.mode != RobotMode.USER_STOPPED:
-            return
-        self._user_stop_left -= 1
-        if self._user_stop_left <= 0:
-            self.mode = RobotMode.REFLEX if self.errors.any() else RobotMode.IDLE
 
     def _move(self, motion: CommandedMotion, command: RobotCommand | None) -> None:
         """Drive the arm for one tick of a motion, or end it."""

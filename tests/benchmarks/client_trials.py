@@ -9,7 +9,6 @@ missing ones).
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import subprocess
@@ -17,12 +16,12 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.helpers import fci_clients
+from tests.helpers.benchmark import options, write
 
 HOST, THING_M = "127.0.0.1", 0.03
 FLOOR_M, PRESS_N = 0.5, 5.0  # what Force presses on, 9 cm below the start
@@ -237,12 +236,10 @@ def trials(client: str, count: int) -> dict[str, Any]:
 
 def main() -> int:
     """All trials of the clients that are installed; 1 where one failed."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, trials=20)
     add = parser.add_argument
     add("--client", choices=PROTOCOLS, nargs="+", default=list(PROTOCOLS))
-    add("--trials", type=int, default=20)
     add("--one", action="store_true", help="one trial, in this process")
-    add("--json", type=Path)
     args = parser.parse_args()
     if args.one:
         one_trial(args.client[0])
@@ -259,8 +256,7 @@ def main() -> int:
             print(f"{client} {name}: {errors[0]}")
         seen = ("ticks", "stalled_ms", "commands_received", "commands_missed", "violations")
         print({key: found["robot"][key] for key in seen}, flush=True)
-    if args.json is not None:
-        args.json.write_text(json.dumps(account, indent=1) + "\n", "utf-8")
+    write(args.json, account)
     return int(any(found["failed"] for found in account.values()))
 
 

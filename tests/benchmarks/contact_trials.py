@@ -7,10 +7,7 @@ model's observer and the documented model's see the same samples. `make trials`.
 
 from __future__ import annotations
 
-import argparse
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +27,7 @@ from drivers.pybullet_arm import PyBulletArm
 from sim.effects import Effect
 from sim.scenarios import Scenario, build
 from tests.helpers.arm_data import panda_model
+from tests.helpers.benchmark import options, told
 
 PUSH_S, EVERY_S, SETTLE_S = 0.5, 5.0, 0.5
 QUIET_FROM_S = 5.0  # after the begin of learning, before which nothing is counted
@@ -103,18 +101,14 @@ def _score(observer: ContactObserver, times: list[float], learn_s: float) -> dic
 
 def main() -> None:
     """Run the trials asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=20)
-    parser.add_argument("--first", type=int, default=100, help="first seed")
+    parser = options(__doc__, trials=20, first=100)
     parser.add_argument("--newton", type=float, default=10.0, help="0: no push at all")
     parser.add_argument("--learn", type=float, default=30.0, metavar="S")
     parser.add_argument("--seconds", type=float, default=60.0, help="after learning")
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    rows = []
-    for seed in range(asked.first, asked.first + asked.trials):
-        rows.append(trial(seed, asked.newton, asked.learn, asked.seconds))
-        print(json.dumps(rows[-1]), flush=True)
+    seeds = range(asked.first, asked.first + asked.trials)
+    how = asked.newton, asked.learn, asked.seconds
+    rows = told((trial(seed, *how) for seed in seeds), asked.json)
     for name in ("learned", "documented"):
         all_ms = [ms for row in rows for ms in row[name]["delay_ms"]]
         seen = [ms for ms in all_ms if ms is not None]
@@ -125,8 +119,6 @@ def main() -> None:
             f"{name}: {len(seen)} of {len(all_ms)} pushes seen, {quick} within 20 ms, median "
             f"{median:.0f} ms; {false} false contacts in {asked.seconds * len(rows):.0f} s"
         )
-    if asked.json:
-        asked.json.write_text(json.dumps(rows) + "\n")
 
 
 if __name__ == "__main__":

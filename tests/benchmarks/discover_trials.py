@@ -6,12 +6,9 @@ half-still motions, for which the tree need not be right but no wrong edge may b
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +17,7 @@ from rich.table import Table
 
 from adapter.discovery import Discovery, discover
 from adapter.model.self_model import SelfModel
+from tests.helpers.benchmark import options, write
 from tests.helpers.discovery_data import TRUSTED, Case, Motion, anyhow, record
 from tests.helpers.discovery_data import robot as model_of
 
@@ -176,14 +174,11 @@ def _print(console: Console, table: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the trials asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser = options(__doc__, trials=20, first=0)
     parser.add_argument("--robot", choices=sorted(ROBOTS), action="append")
     parser.add_argument("--rate", type=float, default=1000.0, help="samples a second")
     parser.add_argument("--hard", action="store_true", help="hard kinds as well")
     parser.add_argument("--kind", action="append", help="only kinds whose name holds this")
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     console, rows = Console(width=150), []
@@ -196,9 +191,7 @@ def main() -> None:
         for seed in range(asked.first, asked.first + asked.trials):  # kinds share their motions
             rows += [trial(robot, kind, seed, asked.rate) for kind in kinds]
             console.print(f"{robot}: seed {seed}", end="\r")
-            if asked.json:
-                told = {"summary": summary(rows), "rows": rows}
-                asked.json.write_text(json.dumps(told, indent=1) + "\n")
+            write(asked.json, {"summary": summary(rows), "rows": rows})
     _print(console, summary(rows))
 
 

@@ -8,11 +8,7 @@ regressor, made with Pinocchio, over the first ten seconds of each path. `make t
 
 from __future__ import annotations
 
-import argparse
-import json
-from dataclasses import replace
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +16,10 @@ import pinocchio
 from scipy.linalg import qr
 from trials import Task, columns_of, held_out, learn
 
-from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.model.robots import documented
 from adapter.signals.records import stamp_of
-from sim.scenarios import build
+from tests.helpers.benchmark import options, told
 
 KINDS = ("random", "designed")
 EVERY_S, PATH_S = 0.25, 10.0
@@ -36,9 +31,7 @@ Curve = list[tuple[float, float, float]]
 def curve(seed: int, kind: str, seconds: float) -> tuple[Curve, np.ndarray]:
     """(t, learner's error, least squares' error), shares of the effort limits, rms of all joints;
     and the states' motion."""
-    q, dq, ddq = held_out(seed)
-    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
-    tau = ModelTorque(truth)(q, dq, ddq)
+    q, dq, ddq, tau = held_out(seed)
     rows: Curve = []
     states: list[np.ndarray] = []
     Y: list[np.ndarray] = []
@@ -112,16 +105,9 @@ def trial(seed: int, seconds: float) -> dict[str, Any]:
 
 def main() -> None:
     """Run the trials."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=13.0)
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    rows = []
-    for seed in range(args.first, args.first + args.trials):
-        rows.append(trial(seed, args.seconds))
-        print(json.dumps(rows[-1]), flush=True)
+    args = options(__doc__, trials=10, first=0, seconds=13.0).parse_args()
+    seeds = range(args.first, args.first + args.trials)
+    rows = told((trial(seed, args.seconds) for seed in seeds), args.json)
     for name in ("learner", "least_squares"):
         for at in REFERENCES_S:
             times = [[row[name][at][kind] or np.inf for kind in KINDS] for row in rows]
@@ -132,8 +118,6 @@ def main() -> None:
             )
     less = [row["condition"]["random"] / row["condition"]["designed"] for row in rows]
     print(f"condition number smaller by {np.median(less):.1f} (median), {min(less):.1f} (least)")
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1))
 
 
 if __name__ == "__main__":

@@ -9,13 +9,10 @@ names no joint. Ends with 1 if any was. Each second arm's model is trusted (`--t
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import time
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -35,6 +32,7 @@ from drivers.faults.driver import with_faults
 from drivers.interface import JointSample
 from sim.obstacles import Obstacles
 from sim.scenarios import Scenario, build
+from tests.helpers.benchmark import options, write
 from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, opened
 
 PANDA = documented("panda")
@@ -168,11 +166,8 @@ def trial(name: str, seed: int) -> tuple[Counter[str], str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, trials=100, first=0)
     parser.add_argument("--driver", choices=["sim", "can", "fci"], default="sim")
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first trial")
-    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     broken: Counter[str] = Counter()
     ends: Counter[str] = Counter()
@@ -190,9 +185,8 @@ def main() -> int:
     print("  " + ", ".join(f"{kind} {broken[kind]}" for kind in KINDS))
     for end, count in ends.most_common():
         print(f"  {count:5d}  {end}")
-    if args.json:
-        numbers = {"trials": args.trials, "broken": {k: broken[k] for k in KINDS}, "ends": ends}
-        args.json.write_text(json.dumps({args.driver: numbers}, indent=1) + "\n", "utf-8")
+    numbers = {"trials": args.trials, "broken": {k: broken[k] for k in KINDS}, "ends": ends}
+    write(args.json, {args.driver: numbers})
     return 1 if bad else 0
 
 

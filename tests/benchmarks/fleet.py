@@ -33,6 +33,7 @@ from adapter.runs.fleet.fleet import Settings, found_logs, learn_fleet
 from adapter.runs.fleet.moments import Task, content_of
 from adapter.signals.validation import smooth
 from drivers.files.mcap import McapWriter, read_log
+from tests.helpers.benchmark import options, write
 
 SEED = 11
 NOISE = 1e-5, 1e-3, 0.05  # rad, rad/s, N m
@@ -222,22 +223,24 @@ def overhead_ms() -> float:
 
 def main() -> None:
     """Measure what the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    about, folder = __doc__.splitlines()[0], Path("runs/bench_fleet")
+    many = {"logs": 200, "plan_hours": 10_000.0, "machines": 100}
+    parser = options(about, seconds=20.0, folder=folder, **many)
     add = parser.add_argument
-    add("--logs", type=int, default=200)
-    add("--seconds", type=float, default=20.0)
-    add("--folder", type=Path, default=Path("runs/bench_fleet"))
-    add("--plan-hours", type=float, default=10_000.0)
-    add("--machines", type=int, default=100)
     add("--compared", type=int, default=20, help="logs of the comparison with other tools")
     add("--simulated", type=int, default=1, help="logs of that with mujoco.sysid")
     add("--only", choices=("fleet", "plain", "sysid"), help=argparse.SUPPRESS)
-    add("--json", type=Path)
     args = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     logs = make_logs(args.folder / "logs", args.logs, args.seconds)
-    if args.only is not None:
-        told = only(args.only, logs[: args.compared], args)
+    if args.only is not None:  # one way of doing the work, in this process
+        some, told = logs[: args.compared], {}
+        if args.only == "sysid":
+            told = mujoco_sysid(some)
+        elif args.only == "plain":
+            plain_loop(some)
+        else:
+            timed(some, args.folder / "only", 0)
         print(json.dumps({**of_this_process(), **told}))
         return
     timed(logs[:2], args.folder / "first", 2)  # kernels are compiled
@@ -265,21 +268,8 @@ def main() -> None:
         "head_s_per_log": head_s,
         **schedule(tasks, per_log_s, head_s, args.machines),
     }
-    text = json.dumps(found, indent=1)
-    print(text)
-    if args.json is not None:
-        args.json.write_text(text + "\n")
-
-
-def only(name: str, logs: list[str], args: argparse.Namespace) -> dict[str, float]:
-    """One way of doing the work, in this process."""
-    if name == "sysid":
-        return mujoco_sysid(logs)
-    if name == "plain":
-        plain_loop(logs)
-    else:
-        timed(logs, args.folder / "only", 0)
-    return {}
+    print(json.dumps(found, indent=1))
+    write(args.json, found)
 
 
 if __name__ == "__main__":

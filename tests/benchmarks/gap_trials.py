@@ -6,16 +6,12 @@ sealed, and is opened after it has answered.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import resource
 import tempfile
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +19,7 @@ from drivers.files.mcap import Log
 from sim.hidden import Trial, draw, unseal
 from sim.hidden.motion import KINDS
 from sim.hidden.record import pybullet_recording, write
+from tests.helpers.benchmark import in_processes, options
 from tests.helpers.gap_judges import torque_judge
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import detectability
@@ -101,32 +98,25 @@ def told(row: Row) -> str:
 
 def main() -> None:
     """Run the trials asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser = options(__doc__, trials=300, first=0, jobs=2)
     parser.add_argument("--simulator", choices=sorted(SIMULATORS), help="default: see BY_SEED")
     parser.add_argument("--kind", choices=("null", "single", "pair", "outside"))
     parser.add_argument("--effect", help="of all trials, instead of a drawn one")
     parser.add_argument("--motion", choices=KINDS, help="of all trials, instead of a drawn one")
     parser.add_argument("--sticks", action="store_true", help="Coulomb friction in every joint")
-    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--judge", action="store_true", help="torque error against the oracle's")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so long")
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
     seeds = range(asked.first, asked.first + asked.trials)
     same = asked.kind, asked.effect, asked.simulator, asked.judge, asked.motion, asked.sticks
     jobs = [(seed, *same) for seed in seeds]
     rows = []
     begun = time.monotonic()
-    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(_job, jobs):
-            rows.append(row)
-            print(told(row), flush=True)
-            if time.monotonic() - begun > 60.0 * asked.minutes:
-                pool.shutdown(wait=False, cancel_futures=True)
-                break
+    for row in in_processes(_job, jobs, asked.jobs):
+        rows.append(row)
+        print(told(row), flush=True)
+        if time.monotonic() - begun > 60.0 * asked.minutes:
+            break
     done = [row for row in rows if "failed" not in row]
     figures = summary(done)
     figures["failed"] = len(rows) - len(done)

@@ -7,10 +7,7 @@ Goal: axes placed to 0.2 degrees and 1 mm against each other, some links without
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +19,7 @@ from adapter.runs.outcome import learned_model
 from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.link_imus import with_link_imus
 from tests.helpers.arm_data import panda_model
+from tests.helpers.benchmark import options, told
 from tests.helpers.imu_data import Parts, axis_errors, record
 
 SEEDS, SECONDS = 10, 30.0
@@ -53,19 +51,10 @@ def trial(seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Run them, print one line each, write all."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    rows = []
-    for seed in range(args.seeds):
-        rows.append(trial(seed))
-        print(json.dumps(rows[-1]), flush=True)
+    args = options(__doc__, seeds=SEEDS).parse_args()
+    rows = told(map(trial, range(args.seeds)), args.json)
     bad = [row for row in rows if row["degrees"] > GOAL_DEG or row["mm"] > GOAL_MM]
     print(f"{len(rows) - len(bad)} of {len(rows)} within {GOAL_DEG} degrees and {GOAL_MM} mm")
-    if args.json is not None:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(rows, indent=1))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import json
 import os
 import warnings
 from collections.abc import Callable
@@ -34,6 +33,7 @@ from adapter.model.urdf import read_urdf
 from adapter.physics.identifiability import random_motion
 from adapter.physics.kernels import Frames, base_at_rest, frames_of, link_motions
 from adapter.signals.front_end import FrontEnd
+from tests.helpers.benchmark import Row, options, write
 from tests.helpers.cad_trees import cad_tree
 
 ARMS = {
@@ -60,8 +60,6 @@ NO_ARMS = (
     "'panda-adapter[robots]', or name the folder of its robots in ERD_ROBOTS"
 )
 NOISE = 2e-5, 1e-3  # of q, rad, and dq, rad/s
-
-Row = dict[str, Any]
 
 
 def robots_folder() -> Path | None:
@@ -165,13 +163,10 @@ def arm_trial(name: str, seeds: int) -> list[Row]:
 
 def main() -> None:
     """Run the trials that were asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, seeds=3, workers=2)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}")
     parser.add_argument("--first", type=int, default=0, help="number of the first tree")
     parser.add_argument("--trials", type=int, default=200, help="how many trees")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     rows: list[Row] = []
     with ProcessPoolExecutor(args.workers) as pool:
@@ -179,8 +174,7 @@ def main() -> None:
             if kind not in KINDS:
                 parser.error(f"no kind '{kind}'; have: {', '.join(KINDS)}")
             rows += _trials(pool, kind, args)
-    if args.json is not None:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    write(args.json, rows)
 
 
 def _trials(pool: ProcessPoolExecutor, kind: str, args: argparse.Namespace) -> list[Row]:

@@ -8,15 +8,11 @@ half of the arms pick up a load. Two of three logs are MuJoCo's, the others Pino
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +23,7 @@ from sim.hidden import Trial, draw
 from sim.hidden.motion import STEP_S, draw_motion
 from sim.hidden.record import write
 from sim.hidden.sizes import COULOMB, draw_bristles, draw_effect, torque_size
+from tests.helpers.benchmark import in_processes, options, told
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_tools import pinocchio_recording
 
@@ -72,9 +69,9 @@ def run(seed: int) -> dict[str, Any]:
         done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
         if done.returncode not in (0, 9):  # 9: not converged
             return {"seed": seed, "failed": done.stderr}
-        told = json.loads(figures.read_text("utf-8"))["disagreements"]
+        said = json.loads(figures.read_text("utf-8"))["disagreements"]
     late, false = None, []
-    for entry in told:
+    for entry in said:
         near = [abs(entry["since_s"] - start_s) < NEAR_S for start_s, _ in loads]
         if late is None and entry["what"] == "payload" and any(near):
             late = entry["reported_s"] - loads[0][0]
@@ -85,17 +82,9 @@ def run(seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Run the trials asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--jobs", type=int, default=2)
-    asked = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
-    rows = []
-    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(run, range(asked.first, asked.first + asked.trials)):
-            rows.append(row)
-            print(json.dumps(row), flush=True)
+    asked = options(__doc__, trials=100, first=0, jobs=2).parse_args()
+    seeds = range(asked.first, asked.first + asked.trials)
+    rows = told(in_processes(run, seeds, asked.jobs), asked.json)
     done = [row for row in rows if "failed" not in row]
     loads = [row for row in done if row["load"]]
     seen = [row["late_s"] for row in loads if row["late_s"] is not None]

@@ -10,7 +10,6 @@ its own on one thread, kernels compiled before; on a shared machine processor ti
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -21,6 +20,7 @@ from typing import Any
 
 from adapter.model.robots import documented
 from drivers.files.mcap import McapWriter
+from tests.helpers.benchmark import options, write
 from tests.helpers.long_arm import LOAD_KG, PUSH_LASTS_S, PUSH_N, RATE_HZ, SEED, Hidden, samples
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -89,15 +89,13 @@ def commands(log: Path, every: list[int], folder: Path, gap: bool) -> dict[str, 
 
 def main() -> None:
     """Measure what the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    about = __doc__.splitlines()[0]
+    parser = options(about, seed=SEED, folder=Path("/tmp/w/long_logs"))
     parser.add_argument("--seconds", type=int, nargs="+", default=[60, 300, 600])
     parser.add_argument("--every", type=int, nargs="*", default=[1, 50])
     parser.add_argument("--gap", action="store_true", help="measure gap too")
     parser.add_argument("--hidden", action="store_true", help="in recordings that hold more")
     parser.add_argument("--holds", action="store_true", help="the hand puts its load down")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--folder", type=Path, default=Path("/tmp/w/long_logs"))
-    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -121,8 +119,7 @@ def main() -> None:
                 row["told"] = told(Path(command[command.index("--out") + 1]), hidden)
                 for key, value in row["told"].items():
                     print(f"         {key}: {value}", flush=True)
-    if args.json is not None:
-        args.json.write_text(json.dumps(rows, indent=1))
+    write(args.json, rows)
 
 
 if __name__ == "__main__":

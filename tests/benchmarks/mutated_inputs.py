@@ -7,7 +7,6 @@ limited. Inputs are good ones with bytes or words changed, cut, doubled or put i
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -22,11 +21,14 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from tests.helpers.benchmark import options, write
 
 LIMIT_S, LIMIT_BYTES = 5.0, 2**30
 WORDS = (
@@ -314,6 +316,13 @@ def commands(folder: Path) -> dict[str, Decoder]:
     csv = b"time,q,dq,tau\n" + b"".join(b"%.3f,1.5,2e-3,-7\n" % (1e-3 * k) for k in range(20))
     columns = ("--columns", "time=0,q=1,dq=2,tau=3", "--to", str(folder / "to.mcap"))
 
+    def answered(*words: str) -> int:
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            code = main(list(words))
+        assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
+        return code
+
     def given(name: str, *words: str) -> Callable[[bytes], object]:
         path = folder / name
 
@@ -321,11 +330,7 @@ def commands(folder: Path) -> dict[str, Decoder]:
             path.write_bytes(data)
             for old in ("to.mcap", "mended.mcap"):
                 (folder / old).unlink(missing_ok=True)
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                code = main([word.replace("FILE", str(path)) for word in words])
-            assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
-            return code
+            return answered(*(word.replace("FILE", str(path)) for word in words))
 
         return run
 
@@ -350,29 +355,18 @@ def commands(folder: Path) -> dict[str, Decoder]:
     results = folder / "results"
     given("x.mcap", "replay", "FILE", "--robot", arm, "--no-report", "--out", str(results))(log)
     good = {path.name: path.read_bytes() for path in results.iterdir() if path.is_file()}
+
+    def reported(name: str, data: bytes) -> int:
+        for other, content in good.items():
+            (results / other).write_bytes(data if other == name else content)
+        return answered("report", str(results))
+
     for name, data in good.items():
-        lines[f"report {name}"] = data, _reported(results, good, name), name.endswith("json")
+        lines[f"report {name}"] = data, partial(reported, name), name.endswith("json")
     return {
         f"adapter {name}": Decoder([seed], run, (), 0.0005, text)
         for name, (seed, run, text) in lines.items()
     }
-
-
-def _reported(results: Path, good: dict[str, bytes], name: str) -> Callable[[bytes], object]:
-    """What makes the page of a run one of whose files was changed."""
-    from adapter.cli.exit_codes import ExitCode
-    from adapter.cli.main import main
-
-    def run(data: bytes) -> int:
-        for other, content in good.items():
-            (results / other).write_bytes(data if other == name else content)
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            code = main(["report", str(results)])
-        assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
-        return code
-
-    return run
 
 
 def everything(folder: Path) -> Iterator[tuple[str, Decoder]]:
@@ -421,14 +415,12 @@ def try_one(name: str, count: int, seconds: float, seed: int, keep: Path) -> dic
 
 def main_trials() -> int:
     """All decoders, each in a process of its own; 1 where there was a fault."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, seed=0)
     add = parser.add_argument
     add("--count", type=int, default=1_000_000, help="inputs altogether")
     add("--seconds", type=float, default=600.0, help="at most, for each decoder")
-    add("--seed", type=int, default=0)
     add("--only", help="one decoder, in this process")
     add("--keep", type=Path, default=Path("runs/mutated"), help="where inputs at fault go")
-    add("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     args.keep = args.keep.resolve()
@@ -457,8 +449,7 @@ def main_trials() -> int:
         for fault in dict.fromkeys(found["faults"]):
             print(fault, flush=True)
     print(f"{sum(x['tried'] for x in account.values())} inputs")
-    if args.json is not None:
-        args.json.write_text(json.dumps(account, indent=1) + "\n")
+    write(args.json, account)
     return int(any(x["faults"] for x in account.values()))
 
 

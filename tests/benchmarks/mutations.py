@@ -8,8 +8,6 @@ test notices is a hole in the tests; one whose text is not found any more is an 
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -20,6 +18,8 @@ import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.helpers.benchmark import options, write
 
 ROOT = Path(__file__).parents[2]
 LIST = Path(__file__).with_name("mutations.toml")
@@ -113,12 +113,10 @@ def noticed(mutation: Mutation, limit_s: float) -> str:
 
 def main() -> int:
     """Run the list; exit code 1 where fewer than nine in ten are noticed."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, processes=2)
     parser.add_argument("--first", type=int, default=0, help="number of the first mutation")
     parser.add_argument("--trials", type=int, help="how many (all)")
-    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--limit", type=float, default=600.0, metavar="S", help="for one mutation")
-    parser.add_argument("--json", type=Path, metavar="FILE")
     wanted = parser.parse_args()
     chosen = mutations()[wanted.first :][: wanted.trials]
     rows = []
@@ -130,8 +128,7 @@ def main() -> int:
             rows.append({"file": mutation.file, "was": mutation.was, "verdict": verdict})
     caught = sum(row["verdict"] == "caught" for row in rows)
     print(f"{caught} of {len(rows)} noticed, {time.perf_counter() - begun:.0f} s")
-    if wanted.json:
-        wanted.json.write_text(json.dumps({"noticed": caught, "rows": rows}, indent=1) + "\n")
+    write(wanted.json, {"noticed": caught, "rows": rows})
     return 0 if 10 * caught >= 9 * len(rows) else 1
 
 

@@ -10,7 +10,7 @@ false, is all that is asked. `make trials`.
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,6 +39,7 @@ from drivers.interface import Array, JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 from tests.helpers.arm_data import panda_model
+from tests.helpers.benchmark import options, told
 
 RATES = (1000, 500, 250, 125, 60, 30)
 REST_S = 1.5  # of each rest
@@ -86,16 +87,13 @@ def recorded(seed: int, recipe: Recipe) -> tuple[Log, SelfModel]:
     if ended.fault is not None:
         raise SystemExit(f"seed {seed}: {ended.fault}")
     q, dq, tau = (np.array([getattr(x, name) for x in samples]) for name in ("q", "dq", "tau"))
-    log = Log(Path("rate.mcap"), robot.tree.joint_names, _stamps(samples), q, dq, tau)
+    stamps = np.array([x.stamp_ns for x in samples], dtype=np.int64)
+    log = Log(Path("rate.mcap"), robot.tree.joint_names, stamps, q, dq, tau)
     if links:
         heard = [x.links for x in samples if x.links is not None]
         twists, accels = (np.array([getattr(x, k) for x in heard]) for k in ("twist", "accel"))
         log = replace(log, link_names=robot.tree.body_names, twists=twists, accels=accels)
     return log, robot
-
-
-def _stamps(samples: list[JointSample]) -> np.ndarray:
-    return np.array([x.stamp_ns for x in samples], dtype=np.int64)
 
 
 def least_squares(log: Log, until_s: float, robot: SelfModel) -> Array:
@@ -206,41 +204,33 @@ def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    add = parser.add_argument
-    add("--trials", type=int, default=5)
-    add("--first", type=int, default=200, help="first seed")
-    add("--rates", type=int, nargs="+", default=RATES)
-    add("--seconds", type=float, default=40.0)
-    add("--slower", type=float, default=1.0, help="than usual")
-    add("--links", action="store_true", help="links are measured")
-    add("--every", type=int, default=1)
-    add("--unchanged", action="store_true", help="count changes announced in logs without any")
-    add("--json", type=Path)
-    asked = parser.parse_args()
-    rows = []
+def rows_of(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Of each seed and rate what the command line asked for."""
     for seed in range(asked.first, asked.first + asked.trials):
-        log, robot = recorded(seed, _recipe(asked, seed))
+        recipe = Recipe(asked.seconds, asked.slower, asked.links)
+        if asked.unchanged:
+            slower = asked.slower * (SLOWER_UNCHANGED if seed % 2 else 1.0)
+            recipe = recipe._replace(slower=slower, rest_every=4.0)
+        log, robot = recorded(seed, recipe)
         for rate in asked.rates:
             if asked.unchanged:
-                found = announced_at_rate(log, rate, robot)
+                yield {"seed": seed, **announced_at_rate(log, rate, robot)}
             else:
-                found = at_rate(log, rate, robot, asked.every)
-            rows.append({"seed": seed, **found})
-            print(json.dumps(rows[-1]), flush=True)
+                yield {"seed": seed, **at_rate(log, rate, robot, asked.every)}
+
+
+def main() -> None:
+    parser = options(__doc__, trials=5, first=200, seconds=40.0, every=1)
+    add = parser.add_argument
+    add("--rates", type=int, nargs="+", default=RATES)
+    add("--slower", type=float, default=1.0, help="than usual")
+    add("--links", action="store_true", help="links are measured")
+    add("--unchanged", action="store_true", help="count changes announced in logs without any")
+    asked = parser.parse_args()
+    rows = told(rows_of(asked), asked.json)
     for what in () if asked.unchanged else ("friction_nm", "inertia_kgm2"):
         for rate, (median, worst) in bias(rows, what).items():
             print(f"{what} at {rate} Hz: off by {median:.1%} (median), {worst:.1%} (worst joint)")
-    if asked.json is not None:
-        asked.json.write_text(json.dumps(rows) + "\n")
-
-
-def _recipe(asked: argparse.Namespace, seed: int) -> Recipe:
-    if not asked.unchanged:
-        return Recipe(asked.seconds, asked.slower, asked.links)
-    slower = asked.slower * (SLOWER_UNCHANGED if seed % 2 else 1.0)
-    return Recipe(asked.seconds, slower, asked.links, rest_every=4.0)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,9 @@ arm, restarted from the data every 0.5 s, in every simulator; the same is done w
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import time
 import traceback
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,6 +26,7 @@ from adapter.model.self_model import SelfModel
 from adapter.simulate import SIMULATORS, Rollouts
 from drivers.files.mcap import Log
 from sim.hidden import Trial, draw
+from tests.helpers.benchmark import in_processes, options, told
 from tests.helpers.gap_oracle import second
 
 
@@ -81,7 +77,7 @@ def _job(job: tuple[int, str, str]) -> dict[str, Any]:
         return {"seed": job[0], "effect": job[1], "failed": traceback.format_exc()}
 
 
-def told(row: dict[str, Any]) -> str:
+def lines_of(row: dict[str, Any]) -> str:
     """A few lines of a trial."""
     if "failed" in row:
         return f"{row['effect']} {row['seed']}: failed\n{row['failed']}"
@@ -96,29 +92,19 @@ def told(row: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the trials asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, first=0, jobs=2)
     parser.add_argument("--effects", nargs="+", default=list(CATALOGUE), choices=list(CATALOGUE))
     parser.add_argument("--trials", type=int, default=3, help="seeds of each effect")
-    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--maker", choices=sorted(MAKERS), default="mujoco")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
     seeds = range(asked.first, asked.first + asked.trials)
     jobs = [(seed, effect, asked.maker) for effect in asked.effects for seed in seeds]
-    rows = []
-    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(_job, jobs):
-            rows.append(row)
-            print(told(row), flush=True)
+    rows = told(in_processes(_job, jobs, asked.jobs), asked.json, lines_of)
     done = [row for row in rows if "failed" not in row]
     for name in SIMULATORS:
         ratios = np.array([row[name]["ratio"] for row in done])
         within = f"{int((ratios <= 1.1).sum())} of {len(rows)} within 1.1 of the truth's error"
         print(f"{name}: {within}, median {np.median(ratios):.3f}, worst {ratios.max():.3f}")
-    if asked.json:
-        asked.json.write_text(json.dumps(rows) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The online learner on whole robots: what a sample costs, and what λ and θ are worth.
 
-    python tests/benchmarks/tree_rate.py [--robot atlas panda] [--json FILE]
+    PYTHONPATH=. python tests/benchmarks/tree_rate.py [--robot atlas panda] [--json FILE]
 
 ATLAS (30 joints) and the Panda on a floating base fall freely, seen by gyroscopes and
 accelerometers. Prints p50 and p99 of each part of a sample's work on one core, when λ had settled,
@@ -9,8 +9,6 @@ and θ's torque error on a motion never learned from, over that of batch least s
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -28,8 +26,7 @@ from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_zxz
 from sim.falls.data_set import data_set
 from sim.falls.tree_truth import TreeLimits, TreeTruth
-
-Row = dict[str, Any]
+from tests.helpers.benchmark import Row, options, write
 
 
 def motions(robot: str, folder: Path, count: int) -> tuple[Any, list[TreeData]]:
@@ -71,26 +68,21 @@ def parts_of(learner: OnlineLearner, data: TreeData, repeats: int) -> Row:
     states = data.take(slice(0, repeats)).states(first_ns=10**15)
     spare = theta.empty_moments()
 
-    def look(k: int) -> None:
-        schema.updates = 0
+    def gradient(updates: int) -> None:
+        schema.updates = updates
         schema.compute_gradient()
-
-    def glance(k: int) -> None:
-        schema.updates = 1
-        schema.compute_gradient()
-
-    def redo(k: int) -> None:
-        theta.absorb_again(frames, states[k : k + 3], spare)
 
     work: dict[str, Callable[[int], object]] = {
         "moments of λ": lambda k: schema.absorb(states[k : k + 1]),
-        "gradient of λ": glance,
-        "gradient of λ with a look at its curvature (every 20th)": look,
+        "gradient of λ": lambda k: gradient(1),
+        "gradient of λ with a look at its curvature (every 20th)": lambda k: gradient(0),
         "regressor and prediction": lambda k: theta.errors(frames, states[k : k + 1]),
         "regressor, prediction, moments of θ": lambda k: theta.absorb_again(
             frames, states[k : k + 1], spare
         ),
-        "three samples redone (while a rebuild lasts)": redo,
+        "three samples redone (while a rebuild lasts)": lambda k: theta.absorb_again(
+            frames, states[k : k + 3], spare
+        ),
         "gradient of θ": lambda k: theta.compute_gradient(),
         "ADAM on λ and θ": lambda k: learner.adam.step(),
     }
@@ -129,12 +121,11 @@ def print_row(row: Row) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="The online learner on whole robots.")
+    parser = options("The online learner on whole robots.")
     parser.add_argument("--robot", nargs="+", default=["atlas", "panda"])
     parser.add_argument("--seconds", type=float, default=30.0, help="of motion to learn from")
     parser.add_argument("--data", type=Path, help="folder of the simulated motions")
     parser.add_argument("--exact", action="store_true", help="without noise")
-    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
@@ -146,8 +137,7 @@ def main() -> None:
             row["parts_p50_us"] = parts_of(learner, data, 500)
             print_row(row)
             rows.append(row)
-    if args.json is not None:
-        args.json.write_text(json.dumps(rows, indent=1, ensure_ascii=False))
+    write(args.json, rows)
 
 
 if __name__ == "__main__":

@@ -74,11 +74,6 @@ class Task:
     rests: tuple[tuple[float, float], ...] = ()
     arm_of: Callable[[Scenario, int], Driver] | None = None
 
-    def arguments(self) -> list[str]:
-        """Of the command."""
-        run = ["run", "--scenario", self.scenario, "--seed", str(self.seed)]
-        return [*run, "--duration", str(self.duration_s), *self.options]
-
 
 def learn(
     task: Task, look: Callable[[OnlineLearner, np.ndarray], None] = lambda learner, record: None
@@ -87,7 +82,9 @@ def learn(
     import torch
 
     torch.set_num_threads(1)
-    args = build_parser().parse_args(task.arguments())
+    run = ["run", "--scenario", task.scenario, "--seed", str(task.seed)]
+    run += ["--duration", str(task.duration_s), *task.options]
+    args = build_parser().parse_args(run)
     plan = run_plan(args)
     config, robot, world = plan.config, plan.robot, plan.world
     assert world is not None
@@ -132,8 +129,8 @@ def schema_trial(job: tuple[str, int, str]) -> Row:
     }
 
 
-def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(q, dq, ddq) of a motion that was never learned from."""
+def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(q, dq, ddq) of a motion that was never learned from, and the true torque along it."""
     motion = RandomMotion(
         MotionLimits.of(documented("panda")),
         np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4]),
@@ -144,7 +141,8 @@ def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         motion.advance(0.02)
         rows.append((motion.q.copy(), motion.dq.copy(), motion.ddq.copy()))
     q, dq, ddq = (np.array(column) for column in zip(*rows, strict=True))
-    return q, dq, ddq
+    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
+    return q, dq, ddq, ModelTorque(truth)(q, dq, ddq)
 
 
 def columns_of(theta: Theta, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
@@ -169,9 +167,7 @@ def theta_trial(
     Both are judged by torque, effects included, on a noiseless motion that neither has seen.
     """
     (seed,) = job
-    q, dq, ddq = held_out(seed)
-    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
-    tau = ModelTorque(truth)(q, dq, ddq)
+    q, dq, ddq, tau = held_out(seed)
     Y: list[np.ndarray] = []
     ratios: list[tuple[float, ...]] = []
     lowest = [np.inf]
@@ -218,16 +214,9 @@ def theta_trial(
 
 def can_arm(world: Scenario, seed: int) -> Driver:
     """The arm behind Damiao motors: 16, 12 and 12 bits, replies of the joints one by one."""
-    from drivers.damiao.arm import DamiaoArm
-    from sim.damiao.line import Line
-    from sim.damiao.server import Boards
-    from tests.helpers.can_lockstep import Lockstep
+    from tests.helpers.can_lockstep import on_line
 
-    line = Line()
-    line.attach(Boards(line.boards, world, now_ns=line.now_ns))
-    address, names = "can://line?interface=virtual", world.truth.joint_names
-    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-    return Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
+    return on_line(world)[0]
 
 
 def wire_trial(job: tuple[str, int]) -> Row:

@@ -9,26 +9,22 @@ other names are wrong.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
 import traceback
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim.hidden.record import write_files
 from sim.hidden.trial import nominal_urdf
 from sim.hidden.twins import draw_twin
+from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_scorer import wilson
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
 from tests.helpers.weighed import weighed
 
-Row = dict[str, Any]
 TRUE = {
     "coulomb_friction",
     "viscous_friction",
@@ -108,21 +104,13 @@ def summary(rows: list[Row]) -> list[str]:
 
 def main() -> None:
     """Run the seeds asked for and print a line each."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--trials", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    rows: list[Row] = []
+    args = options(__doc__, first=0, trials=200, workers=2).parse_args()
     seeds = range(args.first, args.first + args.trials)
-    with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(run, seeds):
-            rows.append(row)
-            shown = {k: v for k, v in row.items() if k not in ("load_at",)}
-            print(json.dumps(shown), flush=True)
-            if args.json:
-                args.json.write_text(json.dumps(rows))
+    rows = told(
+        in_processes(run, seeds, args.workers),
+        args.json,
+        lambda row: json.dumps({k: v for k, v in row.items() if k != "load_at"}),
+    )
     print("\n".join(summary(rows)))
 
 

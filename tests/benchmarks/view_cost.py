@@ -10,7 +10,6 @@ nothing; `--awake` gives it ordinary priority, which it never has: more than it 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -29,6 +28,7 @@ from soak import family
 
 from adapter.realtime.loop_board import BLOCK_BYTES, LoopBoard, LoopTiming
 from adapter.realtime.shared import SHM_FOLDER, SharedBlock
+from tests.helpers.benchmark import options, write
 from tests.helpers.browser import Tab, tab
 
 SETTLE_S, EDGE_S = 4.0, 1.5  # after the first frame, and after each change of what is shown
@@ -223,22 +223,19 @@ def whole_runs(pairs: int, seconds: float) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument("--pairs", type=int, default=8, help="of stretches in the run (default 8)")
     parser.add_argument("--seconds", type=float, default=8.0, help="of a stretch (default 8)")
     parser.add_argument("--whole", type=int, default=0, help="pairs of whole runs beside it")
     parser.add_argument("--awake", action="store_true", help="the view at ordinary priority")
-    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     load = os.getloadavg()[0]
     told = {"load_before": load, "one_run": in_one_run(args.pairs, args.seconds, args.awake)}
     if args.whole:
         told["whole_runs"] = whole_runs(args.whole, 20.0)
     told["load_after"] = os.getloadavg()[0]
-    text = json.dumps(told, indent=1)
-    print(text)
-    if args.json is not None:
-        args.json.write_text(text)
+    print(json.dumps(told, indent=1))
+    write(args.json, told)
 
 
 if __name__ == "__main__":

@@ -98,27 +98,37 @@ def fci(minutes: float, protocol: int, busy: bool) -> dict[str, Any]:
     }
 
 
-def can_on(address: str, read: Callable[[], Any], arm: Any, minutes: float) -> dict[str, Any]:
-    """Hold the arm by torques for so long; `read` lets simulated motors in this process work."""
+def can_on(
+    address: str,
+    arm: Any,
+    minutes: float,
+    stop: Callable[[], None],
+    service: Callable[[], object] = lambda: None,
+) -> dict[str, Any]:
+    """Hold the arm by torques for so long; `service` lets motors of this process work."""
     count = round(60e3 * minutes)
     used = np.zeros(count, np.int64)
     clock = Clock(arm.period_ns)
     for _ in range(200):
         clock.wait()
-        sample = read()
+        service()
+        sample = arm.read()
     q0, tau0 = sample.q, np.nan_to_num(sample.tau)
     K = 0.3 * np.array([600.0, 700.0, 400.0, 600.0, 40.0, 50.0, 10.0])
     unusable = 0
     with RealTime(min(split_cores()[0])):
         for k in range(count):
             clock.wait()
-            sample = read()
+            service()
+            begun = time.thread_time_ns()
+            sample = arm.read()
+            used[k] = time.thread_time_ns() - begun
             unusable += not np.isfinite(sample.q).all()
             tau = tau0 + np.nan_to_num(K * (q0 - sample.q) - 0.01 * K * sample.dq)
             begun = time.thread_time_ns()
             arm.command(tau)
-            used[k] = time.thread_time_ns() - begun + read.used_ns  # type: ignore[attr-defined]
-    arm.stop()
+            used[k] += time.thread_time_ns() - begun
+    stop()
     intake = arm.intake
     return {
         "address": address,
@@ -130,20 +140,6 @@ def can_on(address: str, read: Callable[[], Any], arm: Any, minutes: float) -> d
         "refused": dict(intake.refused),
         "tick_us": spread(used),
     }
-
-
-class Reading:
-    """`arm.read`, with the processor time it took; motors of this process work before it."""
-
-    def __init__(self, arm: Any, service: Callable[[], Any] = lambda: None) -> None:
-        self._arm, self._service, self.used_ns = arm, service, 0
-
-    def __call__(self) -> Any:
-        self._service()
-        begun = time.thread_time_ns()
-        sample = self._arm.read()
-        self.used_ns = time.thread_time_ns() - begun
-        return sample
 
 
 def can_virtual(minutes: float) -> dict[str, Any]:
@@ -164,31 +160,16 @@ def can_virtual(minutes: float) -> dict[str, Any]:
     arm.connect()
     served.serving = False
 
-    def service() -> None:
-        boards.service()
+    def stop() -> None:
+        served.serving = True  # the motors work while the arm stops
+        arm.stop()
 
-    found = can_on(address, Reading(arm, service), _Serving(arm, served), minutes)
+    found = can_on(address, arm, minutes, stop, boards.service)
     arm.close()
     boards.close()
     served.shutdown()
     far.shutdown()
     return found
-
-
-class _Serving:
-    """An arm whose stop lets the motors of this process work."""
-
-    def __init__(self, arm: Any, bus: Any) -> None:
-        self._arm, self._bus = arm, bus
-        self.command, self.period_ns = arm.command, arm.period_ns
-
-    @property
-    def intake(self) -> Any:
-        return self._arm.intake
-
-    def stop(self) -> None:
-        self._bus.serving = True
-        self._arm.stop()
 
 
 def can_udp(minutes: float) -> dict[str, Any]:
@@ -201,7 +182,7 @@ def can_udp(minutes: float) -> dict[str, Any]:
     ):
         arm = DamiaoArm(address + "&guardian=0", allow_motion=True)
         arm.connect()
-        found = can_on(address, Reading(arm), arm, minutes)
+        found = can_on(address, arm, minutes, arm.stop)
         arm.close()
     return found
 

@@ -206,26 +206,22 @@ def tab(folder: Path) -> Iterator[Tab]:
     command = [str(CHROMIUM), *FLAGS, "--remote-debugging-port=0", f"--user-data-dir={profile}"]
     browser = subprocess.Popen([*command, "about:blank"], stderr=subprocess.PIPE, text=True)
     try:
-        yield from _opened(browser)
+        assert browser.stderr is not None
+        for line in browser.stderr:
+            if "DevTools listening on " in line:
+                break
+        else:
+            raise AssertionError("Chromium did not start")
+        whole = line.split()[-1]
+        with connect(whole, compression=None, open_timeout=TIMEOUT_S) as socket:
+            socket.send(json.dumps({"id": 0, "method": "Target.getTargets"}))
+            targets = json.loads(socket.recv())["result"]["targetInfos"]
+        page = next(target for target in targets if target["type"] == "page")
+        host = whole.split("/")[2]
+        place = f"ws://{host}/devtools/page/{page['targetId']}"
+        with connect(place, compression=None, max_size=None, open_timeout=TIMEOUT_S) as socket:
+            yield Tab(socket, browser.pid)
     finally:
         browser.terminate()
         browser.wait(TIMEOUT_S)
         shutil.rmtree(profile, ignore_errors=True)
-
-
-def _opened(browser: subprocess.Popen[str]) -> Iterator[Tab]:
-    assert browser.stderr is not None
-    for line in browser.stderr:
-        if "DevTools listening on " in line:
-            break
-    else:
-        raise AssertionError("Chromium did not start")
-    whole = line.split()[-1]
-    with connect(whole, compression=None, open_timeout=TIMEOUT_S) as socket:
-        socket.send(json.dumps({"id": 0, "method": "Target.getTargets"}))
-        targets = json.loads(socket.recv())["result"]["targetInfos"]
-    page = next(target for target in targets if target["type"] == "page")
-    host = whole.split("/")[2]
-    place = f"ws://{host}/devtools/page/{page['targetId']}"
-    with connect(place, compression=None, max_size=None, open_timeout=TIMEOUT_S) as socket:
-        yield Tab(socket, browser.pid)

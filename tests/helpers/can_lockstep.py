@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from drivers.damiao.arm import DamiaoArm
 from drivers.interface import Driver, JointSample, PassedOn
 from sim.damiao.line import Line
+from sim.damiao.server import Boards
+from sim.scenarios import Scenario
 
 SETTLE_TICKS = 300  # the motors take the arm over from its stand
 
@@ -47,3 +50,17 @@ class Lockstep(PassedOn):
         """Release the driver."""
         with self._line.eager():
             self.driver.close()
+
+    def sleep(self, seconds: float) -> None:
+        """Let the line's time pass, in place of this machine's."""
+        self._line.advance_to(self._line.now_ns() + int(1e9 * seconds))
+
+
+def on_line(world: Scenario) -> tuple[Lockstep, Boards]:
+    """An arm that may move behind Damiao motors on a line of its own, and the motors' boards."""
+    line = Line()
+    boards = Boards(line.boards, world, now_ns=line.now_ns)
+    line.attach(boards)
+    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+    address, names = "can://line?interface=virtual", world.truth.joint_names
+    return Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line), boards

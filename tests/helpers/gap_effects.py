@@ -51,12 +51,6 @@ def _theta_change(effect: Effect, truth: Truth) -> Array:
     return change
 
 
-def _tilted(truth: Truth, effect: Effect) -> Truth:
-    p = effect.parameters
-    R = pin.exp3(np.array([p["rx"], p["ry"], 0.0]))
-    return truth.with_changes(gravity=R.T @ truth.gravity)
-
-
 def rigid_stages(truth: Truth, effects: Sequence[Effect]) -> list[tuple[float, Truth]]:
     """(from s, arm) in order of time, the effects that change bodies or gravity worked in."""
     changes = [e for e in effects if e.name in ("payload", "link_inertia", "base_tilt")]
@@ -66,7 +60,8 @@ def rigid_stages(truth: Truth, effects: Sequence[Effect]) -> list[tuple[float, T
         arm = truth
         for effect in (e for e in changes if e.start_s <= start < e.end_s):
             if effect.name == "base_tilt":
-                arm = _tilted(arm, effect)
+                R = pin.exp3(np.array([effect.number("rx"), effect.number("ry"), 0.0]))
+                arm = arm.with_changes(gravity=R.T @ arm.gravity)
             else:
                 arm = arm.with_changes(theta=arm.theta + _theta_change(effect, arm))
         stages.append((start, arm))

@@ -96,12 +96,8 @@ def pinocchio_trial(
 ) -> tuple[Log, str, dict[str, Any]]:
     """Recording, nominal URDF and truth of a seed; see `sim.hidden.draw`."""
     trial = draw(seed, kind, effect)
-    return pinocchio_recording(trial), nominal_urdf(trial.nominal), truth_of(trial, "pinocchio")
-
-
-def truth_of(trial: Trial, simulator: str) -> dict[str, Any]:
-    """Contents of the truth file."""
-    return {**trial.as_dict(), "simulator": simulator}
+    truth = {**trial.as_dict(), "simulator": "pinocchio"}
+    return pinocchio_recording(trial), nominal_urdf(trial.nominal), truth
 
 
 def write_trial(

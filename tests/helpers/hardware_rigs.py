@@ -6,20 +6,18 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
 from drivers.damiao.arm import DamiaoArm
 from drivers.fci.arm import FciArm
-from drivers.interface import JointSample
+from drivers.interface import Driver, JointSample
 from drivers.ros2.arm import Ros2Arm
-from sim.damiao.line import Line
-from sim.damiao.server import Boards
 from sim.scenarios import build
 from tests.helpers.board_tools import free_port
-from tests.helpers.can_lockstep import Lockstep
+from tests.helpers.can_lockstep import Lockstep, on_line
 from tests.helpers.contract_suite import Start
 
 SERVE = "-m", "adapter", "sim"
@@ -63,11 +61,18 @@ def process(*command: str) -> Iterator[str]:
 
 
 @contextmanager
-def closing() -> Iterator[list]:
-    """Drivers that are closed whatever happens."""
-    arms: list = []
+def one_at_a_time(new: Callable[[], Driver]) -> Iterator[Start]:
+    """Makes drivers of an arm that serves one client at a time, closed whatever happens."""
+    arms: list[Driver] = []
+
+    def make() -> Driver:
+        for arm in arms:
+            arm.close()
+        arms.append(new())
+        return arms[-1]
+
     try:
-        yield arms
+        yield make
     finally:
         for arm in arms:
             arm.stop()
@@ -86,16 +91,10 @@ def fci(protocol: int, allow_motion: bool):
     def start() -> Iterator[Start]:
         options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
         server = process(*SERVE, "fci", *options)
-        with server as line, closing() as arms:
-            address = fci_address(line)
-
-            def make() -> FciArm:
-                for arm in arms:
-                    arm.close()  # the robot serves one client at a time
-                arms.append(FciArm(f"{address}?recover=1", allow_motion=allow_motion))
-                return arms[-1]
-
-            yield make
+        with server as line:
+            address = f"{fci_address(line)}?recover=1"
+            with one_at_a_time(lambda: FciArm(address, allow_motion=allow_motion)) as make:
+                yield make
 
     return start
 
@@ -104,26 +103,22 @@ def fci(protocol: int, allow_motion: bool):
 def can_multicast() -> Iterator[Start]:
     """Boards in a process of their own, on UDP multicast."""
     options = ["--interface", "udp_multicast", "--port", str(free_port())]
-    with process(*SERVE, "can", *options) as line, closing() as arms:
+    with process(*SERVE, "can", *options) as line:
         address = line.split()[-1]
-        yield _maker(arms, address)
+        with one_at_a_time(lambda: OnTime(DamiaoArm(address, allow_motion=True))) as make:
+            yield make
 
 
 @contextmanager
 def can_line() -> Iterator[Start]:
     """Boards in this process on a line in virtual time, where every bit takes what it takes."""
     scenario = build("nominal")
-    names = scenario.truth.joint_names
     with ExitStack() as stack:
 
         def make() -> Lockstep:
-            line = Line()
-            boards = Boards(line.boards, scenario, now_ns=line.now_ns)
+            arm, boards = on_line(scenario)
             stack.callback(boards.close)
-            line.attach(boards)
-            clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-            arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
-            return Lockstep(arm, line)
+            return arm
 
         yield make
 
@@ -133,14 +128,10 @@ def ros2(allow_motion: bool, *options: str):
 
     @contextmanager
     def start() -> Iterator[Start]:
-        with ros2_arm(*options) as address, closing() as arms:
-
-            def make() -> Ros2Arm:
-                for arm in arms:
-                    arm.close()  # two may not publish commands
-                arms.append(Ros2Arm(address, PANDA_JOINTS, allow_motion))
-                return arms[-1]
-
+        with (
+            ros2_arm(*options) as address,
+            one_at_a_time(lambda: Ros2Arm(address, PANDA_JOINTS, allow_motion)) as make,
+        ):
             yield make
 
     return start
@@ -163,13 +154,3 @@ def free_domain() -> int:
                 continue
             return int(domain)
     raise RuntimeError("no DDS domain is free")
-
-
-def _maker(arms: list, address: str) -> Start:
-    def make():
-        for arm in arms:
-            arm.close()
-        arms.append(OnTime(DamiaoArm(address, allow_motion=True)))
-        return arms[-1]
-
-    return make

@@ -8,15 +8,12 @@ from types import ModuleType
 from typing import Any
 
 from drivers.damiao import holding
-from drivers.damiao.arm import DamiaoArm
 from drivers.fci import torque_control
 from drivers.interface import Driver
 from drivers.pybullet_arm import PyBulletArm
-from sim.damiao.line import Line
-from sim.damiao.server import Boards
 from sim.obstacles import Obstacles
 from sim.scenarios import Scenario
-from tests.helpers.can_lockstep import Lockstep
+from tests.helpers.can_lockstep import on_line
 from tests.helpers.fci_lockstep import FciLockstep
 
 # When a motion can begin, by the plant's time: motors of a CAN arm are switched on and settle
@@ -40,27 +37,12 @@ def opened(name: str, world: Scenario) -> Iterator[tuple[Driver, Obstacles]]:
             obstacles = robot.served.arm._plant._engine.obstacles
             after.enter_context(in_place_of_time(torque_control, robot))
         else:
-            line = Line()
-            boards = Boards(line.boards, world, now_ns=line.now_ns)
-            line.attach(boards)
+            driver, boards = on_line(world)
             after.callback(boards.close)
-            clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-            address, names = "can://line?interface=virtual", world.truth.joint_names
-            driver = Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
             obstacles = boards.world._engine.obstacles
-            after.enter_context(in_place_of_time(holding, LineTime(line)))
+            after.enter_context(in_place_of_time(holding, driver))
         after.callback(driver.close)
         yield driver, obstacles
-
-
-class LineTime:
-    """Whoever waits lets a line's time pass."""
-
-    def __init__(self, line: Line) -> None:
-        self._line = line
-
-    def sleep(self, seconds: float) -> None:
-        self._line.advance_to(self._line.now_ns() + int(1e9 * seconds))
 
 
 @contextmanager

@@ -56,13 +56,6 @@ class Hidden:
         return RISES_NM / self.seconds
 
 
-def one_period(seed: int = SEED) -> tuple[Array, Array, Array]:
-    """q, dq, tau (m, 7) of one period without noise."""
-    q, dq, ddq = motion(seed)
-    tau = ModelTorque(documented("panda"))(q, dq, ddq)
-    return q, dq, tau + VISCOUS * dq + DRY * rubs(dq)
-
-
 def rubs(dq: Array) -> Array:
     """Direction (m, 7) of dry friction."""
     return np.asarray(np.tanh(dq / 0.01))
@@ -101,7 +94,9 @@ def samples(
 ) -> Iterator[tuple[Array, ...]]:
     """t, q, dq, tau of a recording of so many seconds, period by period."""
     rng, every = np.random.default_rng(seed), RATE_HZ // rate_hz
-    tables = tuple(x[::every] for x in one_period(seed))
+    q, dq, ddq = motion(seed)  # of one period, without noise
+    tau = ModelTorque(documented("panda"))(q, dq, ddq) + VISCOUS * dq + DRY * rubs(dq)
+    tables = tuple(x[::every] for x in (q, dq, tau))
     load, push = (x[::every] for x in extra_torque(seed))
     for first in range(0, round(seconds * rate_hz), len(load)):
         rows = min(len(load), round(seconds * rate_hz) - first)

@@ -157,26 +157,6 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
         dq[:] = new
 
 
-def draw_servos(
-    rng: np.random.Generator, sizes: Array, feeds_speed: bool = True, noise_rad: float = 2e-5
-) -> Servos:
-    """Servos of an arm whose joints' moments of inertia are about `sizes` (n,) kg m².
-
-    Bandwidths of 5 to 10 Hz, damping of 0.6 to 1, friction as of a geared joint, delays of 1 to
-    8 ms.
-    """
-    n = len(sizes)
-    armature = sizes * rng.uniform(0.3, 1.0, n)
-    moved = sizes + armature
-    omega = 2.0 * np.pi * rng.uniform(5.0, 10.0, n)
-    kp = moved * omega**2
-    viscous = moved * omega * rng.uniform(0.1, 0.4, n)
-    kd = 2.0 * rng.uniform(0.6, 1.0, n) * moved * omega - viscous
-    coulomb = kp * rng.uniform(1e-3, 5e-3, n)
-    delay_s = TICK_S * int(rng.integers(1, 9))
-    return Servos(kp, kd, coulomb, viscous, armature, delay_s, feeds_speed, noise_rad)
-
-
 @dataclass(frozen=True)
 class Drawn:
     """How a recording is drawn.
@@ -237,11 +217,23 @@ class PositionArm:
 
 
 def position_arm(seed: int, drawn: Drawn | None = None) -> PositionArm:
-    """A Panda whose servos, delay, friction and armature are drawn."""
+    """A Panda whose servos, delay, friction and armature are drawn.
+
+    Bandwidths of 5 to 10 Hz, damping of 0.6 to 1, friction as of a geared joint, delays of 1 to
+    8 ms.
+    """
     drawn, rng, truth = drawn or Drawn(), np.random.default_rng(seed), documented("panda")
-    sizes = np.diag(mass_matrix(truth.frames, truth.theta, truth.ready))
-    servos = draw_servos(rng, sizes, drawn.feeds_speed, drawn.noise_rad)
-    factor = 1.0 + drawn.masses_off * rng.standard_normal((truth.n, 1))
+    sizes, n = np.diag(mass_matrix(truth.frames, truth.theta, truth.ready)), truth.n
+    armature = sizes * rng.uniform(0.3, 1.0, n)
+    moved = sizes + armature
+    omega = 2.0 * np.pi * rng.uniform(5.0, 10.0, n)
+    kp = moved * omega**2
+    viscous = moved * omega * rng.uniform(0.1, 0.4, n)
+    kd = 2.0 * rng.uniform(0.6, 1.0, n) * moved * omega - viscous
+    coulomb = kp * rng.uniform(1e-3, 5e-3, n)
+    told = TICK_S * int(rng.integers(1, 9)), drawn.feeds_speed, drawn.noise_rad
+    servos = Servos(kp, kd, coulomb, viscous, armature, *told)
+    factor = 1.0 + drawn.masses_off * rng.standard_normal((n, 1))
     return PositionArm(truth.with_changes(theta=truth.theta * factor), servos, drawn)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.files.mcap import Log
 from sim.hidden.twins import STEP_S, Twin, recorded
-from tests.helpers.gap_effects import Array, rnea
+from tests.helpers.gap_effects import rnea
 from tests.helpers.gap_mujoco import mjcf
 
 STIFF, DAMP, SLOW = 3600.0, 120.0, 6.0  # 1/s2, 1/s and 1/s of the controller
@@ -37,9 +37,13 @@ def by_mujoco(twin: Twin) -> Log:
     arm.qpos[:], arm.qvel[:] = wanted[0][0], wanted[1][0]
     z, behind = twin.friction.start * twin.friction.coulomb, still.copy()
     out = np.empty((3, *wanted[0].shape))
-    for k, row in enumerate(zip(*wanted, strict=True)):
-        behind = behind + STEP_S * (row[0] - arm.qpos)
-        tau = _torque(plan, goal, arm, row, behind)
+    for k, (q, dq, ddq) in enumerate(zip(*wanted, strict=True)):
+        behind = behind + STEP_S * (q - arm.qpos)
+        goal.qpos[:], goal.qvel[:] = arm.qpos, arm.qvel
+        push = STIFF * (q - arm.qpos + SLOW * behind) + DAMP * (dq - arm.qvel)
+        goal.qacc[:] = ddq + push
+        mujoco.mj_inverse(plan, goal)
+        tau = goal.qfrc_inverse.copy()
         out[:, k] = arm.qpos, arm.qvel, tau
         for _ in range(SUBSTEPS):
             z = twin.friction.after(z, arm.qvel, STEP_S / SUBSTEPS)
@@ -50,19 +54,3 @@ def by_mujoco(twin: Twin) -> Log:
     # the torque of a row acts from its stamp to the next one: half a step later than the motion
     out[2, 1:] = (out[2, 1:] + out[2, :-1]) / 2
     return recorded(twin, *out)
-
-
-def _torque(
-    plan: mujoco.MjModel,
-    goal: mujoco.MjData,
-    arm: mujoco.MjData,
-    row: tuple[Array, ...],
-    behind: Array,
-) -> Array:
-    """Torque (n,) of the controller for the wanted q, dq, ddq."""
-    q, dq, ddq = row
-    goal.qpos[:], goal.qvel[:] = arm.qpos, arm.qvel
-    push = STIFF * (q - arm.qpos + SLOW * behind) + DAMP * (dq - arm.qvel)
-    goal.qacc[:] = ddq + push
-    mujoco.mj_inverse(plan, goal)
-    return np.asarray(goal.qfrc_inverse).copy()

@@ -141,8 +141,7 @@ class Region:
         """(k, size) the bytes from each of `start` on."""
         if size == 0 or len(start) == 0:
             return np.empty((len(start), size), np.uint8)
-        rows: NDArray[np.uint8] = np.lib.stride_tricks.sliding_window_view(self.data, size)[start]
-        return rows
+        return np.lib.stride_tricks.sliding_window_view(self.data, size)[start]
 
 
 @dataclass

@@ -1,0 +1,51 @@
+"""What the command lines of `tests/benchmarks` share: options, rows that are told and written."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+HELP = {"first": "first seed"}
+
+
+def options(about: str | None, **defaults: float | Path) -> argparse.ArgumentParser:
+    """A parser of --json FILE and of one option for each default, which has its type."""
+    parser = argparse.ArgumentParser(description=about)
+    for name, value in defaults.items():
+        flag = f"--{name.replace('_', '-')}"
+        parser.add_argument(flag, type=type(value), default=value, help=HELP.get(name))
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    return parser
+
+
+def write(path: Path | None, found: object) -> None:
+    """What was found, as JSON where a file was named."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", "utf-8")
+
+
+def told(
+    rows: Iterable[Row], path: Path | None = None, line: Callable[[Row], str] = json.dumps
+) -> list[Row]:
+    """All rows, each printed and written as it comes: what was found before an end is kept."""
+    found = []
+    for row in rows:
+        found.append(row)
+        print(line(row), flush=True)
+        write(path, found)
+    return found
+
+
+def in_processes(run: Callable[[Any], Row], jobs: Iterable[Any], count: int) -> Iterator[Row]:
+    """Rows of jobs in their order, made by `count` new processes of one thread each."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(run, jobs)
