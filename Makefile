@@ -79,6 +79,8 @@ trials: $(WARM)
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/simulate_trials.py --json runs/simulate_trials.json
 	PYTHONPATH=. $(BIN)/python tests/benchmarks/live_trials.py
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/twin_trials.py --json runs/twin_trials.json
+	PYTHONPATH=. $(BIN)/python tests/benchmarks/law_trials.py --json runs/law_trials.json
+	test ! -d ../shared || PYTHONPATH=. $(BIN)/python tests/benchmarks/odd_trials.py hidden --first 31000 --json runs/odd_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/contact_trials.py --json runs/contact_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/rate_trials.py --json runs/rate_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/rate_trials.py --unchanged --trials 20 --first 300 --seconds 17 --json runs/rate_trials_unchanged.json

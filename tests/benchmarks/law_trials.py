@@ -7,15 +7,11 @@ takes nine tenths of the disturbance away. Formulas are its own.
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,13 +20,13 @@ import numpy as np
 from adapter.gap.workflow import find_gap
 from sim.hidden import Trial, draw, nominal_urdf
 from sim.hidden.record import write_files
+from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_effects import rnea, sense
 from tests.helpers.gap_mujoco import simulate
 from tests.helpers.gap_scorer import wilson
 from tests.helpers.gap_tools import recorded
 
 Array = np.ndarray
-Row = dict[str, Any]
 SIZES_NM, WRIST_SHARE = (0.1, 1.0), 0.3  # rms of the law's torque; of joints 5 to 7
 QUIET, FASTEST = 0.1, 6.0  # of the disturbance; rad/s
 
@@ -136,11 +132,11 @@ def _variables(text: str, joint: int) -> set[str]:
     return {x.removesuffix(str(joint)) for x in re.findall(r"(?:ddq|dq|tau|q|t)\d*", text)} - {"t"}
 
 
-def run(job: Job) -> Row | None:
-    """One trial: what was hidden and what was said; None where the law threw the arm about."""
+def run(job: Job) -> Row:
+    """One trial: what was hidden and what was said; nothing where the law threw the arm about."""
     trial, name, drawn, (q, dq, tau) = _trial(job)
     if not np.abs(dq).max() < FASTEST:
-        return None
+        return {}
     log = recorded(trial, q, dq, tau, None)
     with tempfile.TemporaryDirectory() as folder:
         paths = write_files(log, nominal_urdf(trial.nominal), {}, Path(folder))
@@ -189,21 +185,14 @@ def summary(rows: Sequence[Row]) -> list[str]:
 
 def main() -> None:
     """Run the seeds asked for and print a line each."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--trials", type=int, default=132)
+    parser = options(__doc__, first=0, trials=132, workers=2)
     parser.add_argument("--none", action="store_true", help="hide no law")
-    parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--simulator", choices=("pinocchio", "mujoco"), default="pinocchio")
     parser.add_argument("--quiet", action="store_true", help="a tenth of the disturbance")
     args = parser.parse_args()
-    rows: list[Row] = []
     how = args.none, args.simulator, args.quiet
     jobs = [Job(args.first + k, *how) for k in range(args.trials)]
-    with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-        for row in filter(None, pool.map(run, jobs)):
-            rows.append(row)
-            print(json.dumps(row, default=float), flush=True)
+    rows = told(filter(None, in_processes(run, jobs, args.workers)), args.json)
     print("\n".join(summary(rows)))
 
 

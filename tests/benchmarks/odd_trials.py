@@ -10,17 +10,13 @@ one hidden effect: names and sizes are to be those that the log has without it.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from importlib import import_module
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +27,7 @@ from adapter.effects.robots import read_robot
 from adapter.gap.load import find_load
 from adapter.model.self_model import SelfModel
 from sim.hidden import draw, nominal_urdf
+from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_tools import pinocchio_recording
 
@@ -102,13 +99,16 @@ def differences(name: str, clean: Answer, odd: Answer) -> list[str]:
     return said
 
 
-def at_door(door: str, urdf: Path, folder: Path, name: str, verdict: str) -> list[str]:
-    """What is wrong with the answer to one of the 80 logs."""
+def at_door(door: str, urdf: Path, folder: Path, job: tuple[str, str]) -> Row:
+    """What is wrong with the answer to one of the 80 logs, of a name and a verdict."""
+    (name, verdict), wrong = job, list[str]()
     odd = answer(door, folder / f"{name}.mcap", urdf)
-    if isinstance(odd, str) and (verdict == "refuse" or (verdict == "mend" and "--" in odd)):
-        return [name]
-    clean = answer(door, folder / f"{'loaded_' * name.startswith('loaded_')}base.mcap", urdf)
-    return [name, *(["not refused"] if verdict == "refuse" else differences(name, clean, odd))]
+    if verdict == "refuse":
+        wrong = [] if isinstance(odd, str) else ["not refused"]
+    elif not (verdict == "mend" and isinstance(odd, str) and "--" in odd):
+        clean = answer(door, folder / f"{'loaded_' * name.startswith('loaded_')}base.mcap", urdf)
+        wrong = differences(name, clean, odd)
+    return {"log": name, "wrong": wrong}
 
 
 def tool() -> Any:
@@ -117,7 +117,7 @@ def tool() -> Any:
     return import_module("odd_logs")
 
 
-def hidden(seed: int) -> list[str]:
+def hidden(seed: int) -> Row:
     """What a log of one hidden effect says otherwise once it has a flaw."""
     trial, rng, odd = draw(seed, "single"), np.random.default_rng([seed, 39]), tool()
     log = (mujoco_recording if seed % 2 else pinocchio_recording)(trial)
@@ -130,37 +130,26 @@ def hidden(seed: int) -> list[str]:
         for path in paths:
             odd.write(path, *cases[path.stem][1:])
         clean, flawed = (answer("gap", path, urdf) for path in paths)
-    return [f"{seed} {trial.effects[0].name} {name}", *differences(name, clean, flawed)]
+    wrong = differences(name, clean, flawed)
+    return {"seed": seed, "hidden": trial.effects[0].name, "flaw": name, "wrong": wrong}
 
 
 def main() -> None:
-    """Judge the logs asked for, a line each."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Judge the logs asked for, a line each; --trials is of `hidden`."""
+    parser = options(__doc__, first=1, trials=100, workers=2)
     parser.add_argument("door", choices=(*DOORS, "hidden"))
-    parser.add_argument("--first", type=int, default=1, help="seed; of the loaded logs two more")
-    parser.add_argument("--trials", type=int, default=100, help="of hidden")
-    parser.add_argument("--workers", type=int, default=2)
     args = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
-    right = done = 0
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool,
-    ):
-        if args.door == "hidden":
-            rows = pool.map(hidden, range(args.first, args.first + args.trials))
-        else:
+    run, jobs = hidden, list[Any](range(args.first, args.first + args.trials))
+    with tempfile.TemporaryDirectory() as folder:
+        if args.door != "hidden":
             odd, urdf = tool(), SHARED / "models" / "panda_gaz2019.urdf"
-            recorded = odd.recorded
+            recorded = odd.recorded  # of seeds 1 and 3
             odd.recorded = lambda arm, seed, *more: recorded(arm, seed + args.first - 1, *more)
             odd.main(folder, str(urdf))
-            verdicts = json.loads((Path(folder) / "verdicts.json").read_text())
-            judge = partial(at_door, args.door, urdf, Path(folder))
-            rows = pool.map(judge, verdicts, verdicts.values())
-        for what, *wrong in rows:
-            done, right = done + 1, right + (not wrong)
-            print(f"{what}: {'; '.join(wrong) or 'as it should be'}", flush=True)
-    print(f"right: {right} of {done}")
+            jobs = list(json.loads((Path(folder) / "verdicts.json").read_text()).items())
+            run = partial(at_door, args.door, urdf, Path(folder))
+        rows = told(in_processes(run, jobs, args.workers), args.json)
+    print(f"right: {sum(not row['wrong'] for row in rows)} of {len(rows)}")
 
 
 if __name__ == "__main__":
