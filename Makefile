@@ -72,7 +72,7 @@ $(WARM): $(STAMP)
 trials: $(WARM)
 	mkdir -p runs
 	$(PYTEST) --numprocesses 2 --dist loadfile -m slow
-	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/lambda_trials.py trees arms --json runs/lambda_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/imu_trials.py --json runs/imu_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
