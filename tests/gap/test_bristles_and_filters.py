@@ -75,6 +75,18 @@ def test_a_finer_friction_is_not_given_up_for_coulombs(seed, effect, tmp_path: P
     assert (found.effect, found.joints) == (f"{effect}_friction", trial.effects[0].joints)
 
 
+@pytest.mark.slow
+def test_friction_that_falls_with_the_speed_is_no_law(tmp_path: Path) -> None:
+    """LuGre's in every joint; that of the sixth was taken for dq times a curve over q."""
+    trial = draw(31052, "single")
+    log, model, _ = write(trial, tmp_path, pinocchio_recording(trial))
+    found = {(x.effect, x.joints): x.parameters for x in find_gap([log], model).findings}
+    assert trial.friction is not None and not any(name.startswith("law") for name, _ in found)
+    falls = found["stribeck_friction", (6,)]
+    assert falls["Fc"] == pytest.approx(trial.friction.coulomb[5], rel=0.1)
+    assert falls["Fs"] == pytest.approx(trial.friction.stiction[5], rel=0.1)
+
+
 @pytest.mark.parametrize("ratio", [1e-9, 1e9])
 @pytest.mark.parametrize(("effect", "key"), [(BristleFriction(), "s0"), (StribeckFriction(), "vs")])
 def test_a_search_for_another_shape_stays_among_those_that_may_be(
