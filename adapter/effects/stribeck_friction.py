@@ -75,8 +75,10 @@ class StribeckFriction(Rubs):
     def law(self, at: JointSignals, values: Values) -> Array:
         """The curve times z, where there is a way over which bristles are known to be bent."""
         z, s0 = at.direction, values.get("s0", WAY.lower)
-        bent = sum(x * y for x, y in zip(shares_of_ways(s0), at.bent, strict=True))
-        return np.asarray(self.level(at.dq, values) * np.where(s0 > WAYS_RAD[0], bent, z))
+        if np.max(s0) > WAYS_RAD[0]:
+            bent = sum(x * y for x, y in zip(shares_of_ways(s0), at.bent, strict=True))
+            z = np.where(s0 > WAYS_RAD[0], bent, z)
+        return np.asarray(self.level(at.dq, values) * z)
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """What stays in motion, as dry friction."""

@@ -35,6 +35,12 @@ class Bristles:
         self.effects, self._n, self._period_s = with_bristles(effects), n, period_s
         self._joint = [active.joint for active in self.effects]
         self._way = np.array([a.values["s0"] for a in self.effects], dtype=float)
+        self._kinds: list[tuple[Rubs, list[int], dict[str, Array]]] = []
+        for effect in dict.fromkeys(cast(Rubs, a.effect) for a in self.effects):
+            own = [k for k, a in enumerate(self.effects) if a.effect is effect]
+            numbers = [self.effects[k].values for k in own]
+            values = {key: np.array([x[key] for x in numbers], dtype=float) for key in numbers[0]}
+            self._kinds.append((effect, own, values))
         self._most = self._levels(np.zeros(len(self.effects)))
         self._along: tuple[Array, Array] | None = None
         self.reset()
@@ -82,6 +88,7 @@ class Bristles:
 
     def _levels(self, dq: Array) -> Array:
         """(b,) N m at which they slide at dq (b,), rad/s."""
-        pairs = zip(self.effects, dq[:, None], strict=True)
-        levels = [cast(Rubs, a.effect).level(own, a.values) for a, own in pairs]
-        return np.concatenate([np.zeros(0), *levels])
+        out = np.empty(len(dq))
+        for effect, own, values in self._kinds:
+            out[own] = effect.level(dq[own], values)
+        return out

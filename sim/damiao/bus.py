@@ -25,8 +25,10 @@ INTERFACES = ("udp_multicast", "socketcan")
 MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
 MULTICAST_PORT = 43113  # python-can's default port
 ASK_S = 0.2
-PACKED = ("timestamp", "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame",
-          "channel", "dlc", "data", "is_fd", "bitrate_switch", "error_state_indicator")  # fmt: skip
+PACKED = (
+    *("timestamp", "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame"),
+    *("channel", "dlc", "data", "is_fd", "bitrate_switch", "error_state_indicator"),
+)
 
 
 class BoardsMulticastBus(UdpMulticastBus):
