@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adapter.effects.active import WHOLE
+from adapter.effects.base import LATE
+from adapter.effects.torque import sensors
 from adapter.gap.candidates import Candidate, is_finer, log_odds, simpler_wins
 from adapter.gap.evidence import Carried, scores
-from adapter.gap.fit import Fit, Named, beside
+from adapter.gap.fit import Fit, Named, beside, refitted
 from adapter.gap.scan import SignatureTable
 from adapter.model.spatial import Array
 
@@ -123,7 +125,10 @@ def _standing(
     """The k-th named effect of a fit among the candidates."""
     named, (own, rest) = fit.named[k], beside(fit, k)
     mine = carried.worth(own, rest)
+    value = mine.log_evidence + price(named)
     found = _rivals(named, candidates, products, carried, own, rest)
+    if named.candidate.effect.form == LATE and value > 0.0:
+        found = [_exact(fit, k, mine.chi2, rival) for rival in found]
     best: dict[tuple[str, int], Rival] = {}
     for rival in sorted(found, key=lambda x: -x.log_evidence):
         if named.interval_s == WHOLE or not rival.candidate.effect.steady:
@@ -133,8 +138,33 @@ def _standing(
         replace(r, credible=r.credible and not any(e.covers(r.candidate) for e in fit.named))
         for r in best.values()
     )
-    value = mine.log_evidence + price(named)
     return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.tried)
+
+
+def _exact(fit: Fit, k: int, chi2: float, rival: Rival) -> Rival:
+    """A rival of the k-th named effect, worth `chi2`, as a fit has it in that one's place.
+
+    Only of what makes torques late, which is linear for less than a sample or two alone.
+    """
+    if not (rival.is_alike and rival.candidate.effect.form == LATE):
+        return rival
+    trial, _ = refitted(fit.instead(k, replace(fit.named[k], candidate=rival.candidate, x=rival.x)))
+    told = chi2 + _in_band(fit) - _in_band(trial)
+    worth, x = rival.log_evidence + 0.5 * (told - rival.chi2), trial.named[k].x
+    credible = rival.candidate.possible(x, fit.named[k].interval_s)
+    return replace(rival, log_evidence=worth, chi2=told, x=x, credible=credible)
+
+
+def _in_band(fit: Fit) -> float:
+    """Squared distance of a fit without the noise of the motion, which any low-pass takes off."""
+    left = []
+    for i, own in enumerate(fit.recordings):
+        at, actives = fit.model.stages(i), fit.model.actives(i)
+        rigid = np.column_stack([at.links.inside_band(x, j) for j, x in enumerate(at.rigid.T)])
+        sensed = sensors(at.links, rigid + at.total - at.rigid, actives)
+        left.append(own.heard * (own.tau - own.low(sensed)))
+    white = fit.whiten(left)
+    return float(white @ white + np.sum((fit.coefficients / fit.prior_std) ** 2))
 
 
 def _rivals(

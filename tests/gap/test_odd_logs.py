@@ -137,6 +137,13 @@ def test_a_torque_that_is_not_measured_costs_its_own_joint_and_time_alone(said: 
     assert said in notes
 
 
+def test_ten_milliseconds_late_are_a_delay_and_no_low_pass() -> None:
+    found = adapter.find_gap(late(10), panda_model())
+    timing = [x for x in found.findings if x.effect in ("signal_delay", "torque_filter")]
+    assert [(x.effect, x.joints) for x in timing] == [("signal_delay", ())]
+    assert abs(timing[0].parameters["d"] - 0.01) < 3.0 * timing[0].std["d"] < 2e-3
+
+
 @pytest.mark.parametrize("name", [*UNHEARD, "bursts of zeros"])
 def test_who_learns_is_given_torques_of_the_arm_alone(name: str) -> None:
     log, _ = check_torque(ODD[name](), panda_model())
