@@ -19,10 +19,25 @@ from adapter.cli.options import (
     check_logs,
     check_robot,
     check_told,
+    declaring,
 )
 from adapter.errors import UsageError
 
 READ_S = 120.0  # of `discover`: as long as a recording that other commands hold in memory
+
+
+GAP_WORDS = {
+    "--model": "self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
+    "--servo": "recordings of a position-controlled arm (commanded and measured positions, no "
+    "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
+    "documented them, commands should be where the arm is)",
+    "--inertia-prior": "standard deviation of the model's inertial numbers, of their size "
+    "(default 0.05, centres to 0.1 m times that; of a position-controlled arm 0.02)",
+    "--hold-out": "score on these, fit all others (default: blocks of time are held out in turn)",
+    "--rounds": "rounds of the search, in each of which something may be named (default 24)",
+    "--simulator": "of the forward simulation (default pybullet where it is installed, extra "
+    "[sim]; mujoco is the extra [mujoco])",
+}
 
 
 def declare_gap(parser: argparse.ArgumentParser) -> None:
@@ -35,55 +50,19 @@ def declare_gap(parser: argparse.ArgumentParser) -> None:
         "tell anything is an answer too; one that does not fit the model (another robot, flipped "
         "signs, other units) cannot be used."
     )
-    add = parser.add_argument
+    add = declaring(parser, GAP_WORDS)
     add("logs", nargs="+", type=Path, metavar="LOG", help="recording, or a folder of such")
     add_topic(parser)
-    add(
-        "--model",
-        required=True,
-        metavar="MODEL",
-        help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
-    )
+    add("--model", required=True, metavar="MODEL")
     add_joints(parser)
-    add(
-        "--servo",
-        type=Path,
-        metavar="FILE",
-        help="recordings of a position-controlled arm (commanded and measured positions, no "
-        "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
-        "documented them, commands should be where the arm is)",
-    )
+    add("--servo", type=Path, metavar="FILE")
     add_told(parser)
-    add(
-        "--inertia-prior",
-        type=float,
-        metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.05, "
-        "centres to 0.1 m times that; of a position-controlled arm 0.02)",
-    )
-    add(
-        "--hold-out",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=Path,
-        metavar="LOG",
-        help="score on these, fit all others (default: blocks of time are held out in turn)",
-    )
+    add("--inertia-prior", type=float, metavar="SHARE")
+    add("--hold-out", nargs="+", action="extend", default=[], type=Path, metavar="LOG")
     add("--validate-from", type=float, metavar="S", help="fit before this second, score after it")
-    add(
-        "--rounds",
-        type=int,
-        metavar="N",
-        help="rounds of the search, in each of which something may be named (default 24)",
-    )
+    add("--rounds", type=int, metavar="N")
     add_effects(parser)
-    add(
-        "--simulator",
-        choices=("pybullet", "mujoco"),
-        help="of the forward simulation (default pybullet where it is installed, extra [sim]; "
-        "mujoco is the extra [mujoco])",
-    )
+    add("--simulator", choices=("pybullet", "mujoco"))
     add("--no-simulation", action="store_true", help="compare torques only")
     add_results(parser)
     parser.set_defaults(check=_check_gap)
@@ -123,6 +102,19 @@ def add_effects(parser: argparse.ArgumentParser, default: Path | None = None) ->
     )
 
 
+FLEET_WORDS = {
+    "logs": "recording, folder (with those inside it), pattern ('logs/**/*.mcap'), or address "
+    "that fsspec opens (s3://...); none: those of before alone",
+    "--model": "self model, .urdf, MJCF, or a robot's name",
+    "--by": "what tells arms apart: the name or serial number in the log (default; the model's "
+    "name where there is none), or the folder that it lies in",
+    "--manifest": "a table with a column log, and arm, or numbers that friction may follow "
+    "(temperature, age); goes before --by",
+    "--workers": "processes on this machine (default: as many as it has processors; 0: none "
+    "beside this one)",
+}
+
+
 def declare_fleet(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
@@ -131,47 +123,20 @@ def declare_fleet(parser: argparse.ArgumentParser) -> None:
         "of a recording are kept in --out: recordings join those of before, and none is read "
         "twice. λ is the model's."
     )
-    add = parser.add_argument
-    add(
-        "logs",
-        nargs="*",
-        metavar="LOG",
-        help="recording, folder (with those inside it), pattern ('logs/**/*.mcap'), or address "
-        "that fsspec opens (s3://...); none: those of before alone",
-    )
+    add = declaring(parser, FLEET_WORDS)
+    add("logs", nargs="*", metavar="LOG")
     add_topic(parser)
-    add(
-        "--model", required=True, metavar="MODEL", help="self model, .urdf, MJCF, or a robot's name"
-    )
+    add("--model", required=True, metavar="MODEL")
     add_joints(parser)
     add_told(parser)
-    add(
-        "--by",
-        choices=("log", "folder"),
-        default="log",
-        help="what tells arms apart: the name or serial number in the log (default; the model's "
-        "name where there is none), or the folder that it lies in",
-    )
-    add(
-        "--manifest",
-        type=Path,
-        metavar="CSV",
-        help="a table with a column log, and arm, or numbers that friction may follow "
-        "(temperature, age); goes before --by",
-    )
+    add("--by", choices=("log", "folder"), default="log")
+    add("--manifest", type=Path, metavar="CSV")
     for name, said in (
         ("--forget", "leave these out from now on, though they are gone or given"),
         ("--remember", "do not leave these out any more"),
     ):
         add(name, nargs="+", action="extend", default=[], metavar="LOG", help=said)
-    add(
-        "--workers",
-        type=int,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes on this machine (default: as many as it has processors; 0: none beside "
-        "this one)",
-    )
+    add("--workers", type=int, default=os.cpu_count() or 1, metavar="N")
     add("--cluster", metavar="ADDRESS", help="of a Dask scheduler to send the tasks to")
     add_results(parser)
     parser.set_defaults(check=_check_fleet)
@@ -192,6 +157,12 @@ def _check_fleet(args: argparse.Namespace) -> None:
     check_files(args.manifest)
 
 
+LOAD_WORDS = {
+    "--inertia-prior": "standard deviation of the model's inertial numbers, of their size "
+    "(default 0.05; 0.2 with --empty)",
+}
+
+
 def declare_load(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
@@ -199,7 +170,7 @@ def declare_load(parser: argparse.ArgumentParser) -> None:
         "inertia with standard deviations, and the lines that Franka and Universal Robots take. "
         "Without --empty the documented arm is the reference."
     )
-    add = parser.add_argument
+    add = declaring(parser, LOAD_WORDS)
     add("log", type=Path, metavar="LOG", help="recording with the load, moving or at rest")
     add_topic(parser)
     add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
@@ -207,13 +178,7 @@ def declare_load(parser: argparse.ArgumentParser) -> None:
     add_joints(parser)
     add_told(parser)
     add("--frame", metavar="NAME", help="in whose axes (default: the flange of the last link)")
-    add(
-        "--inertia-prior",
-        type=float,
-        metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.05; "
-        "0.2 with --empty)",
-    )
+    add("--inertia-prior", type=float, metavar="SHARE")
     add_json(parser, or_output=True)
     parser.set_defaults(check=_check_load)
 
@@ -248,6 +213,15 @@ def _check_diff(args: argparse.Namespace) -> None:
     check_robot(args.second)
 
 
+DISCOVER_WORDS = {
+    "log": "MCAP recording with link motion: Imu topics, or /link_twists/<link> and "
+    "/link_accels/<link>",
+    "--seconds": f"read so many seconds, default {READ_S:g}; all of them are held in memory",
+    "--base": "the link that carries all others; needed for a floating base whose links' frames "
+    "do not turn about their z",
+}
+
+
 def declare_discover(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
@@ -255,30 +229,13 @@ def declare_discover(parser: argparse.ArgumentParser) -> None:
         "and who is whose parent, each with a confidence; say what the data leave open; then "
         "learn λ, and θ where torques were recorded."
     )
-    add = parser.add_argument
-    add(
-        "log",
-        type=Path,
-        metavar="LOG",
-        help="MCAP recording with link motion: Imu topics, "
-        "or /link_twists/<link> and /link_accels/<link>",
-    )
+    add = declaring(parser, DISCOVER_WORDS)
+    add("log", type=Path, metavar="LOG")
     add_topic(parser)
     add("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin at this second")
-    add(
-        "--seconds",
-        type=float,
-        default=READ_S,
-        metavar="S",
-        help=f"read so many seconds, default {READ_S:g}; all of them are held in memory",
-    )
+    add("--seconds", type=float, default=READ_S, metavar="S")
     add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
-    add(
-        "--base",
-        metavar="LINK",
-        help="the link that carries all others; needed for a floating base whose links' frames "
-        "do not turn about their z",
-    )
+    add("--base", metavar="LINK")
     add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
     add_json(parser)
     parser.set_defaults(check=_check_discover)

@@ -19,6 +19,7 @@ from adapter.cli.options import (
     check_logs,
     check_robot,
     check_told,
+    declaring,
     numbers,
 )
 from adapter.control.settings import DESIGNED, KINDS
@@ -34,93 +35,55 @@ DEFAULT_PORT, MOST_PORT = 8765, 65535  # of Foxglove; of all
 SHARE, LONGEST_S, RATE_HZ = 0.2, 300.0, 200.0  # of `excite`
 
 
+RUN_WORDS = {
+    "--driver": "pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=..., "
+    "ros2:///joint_states, FILE.py:CLASS of your own",
+    "--allow-motion": "leave to move an arm that may be real (fci, can, ros2): prints the plan, "
+    "goes at a tenth of the speed for 10 s, stops when this terminal closes. Without it, only "
+    "listen",
+    "--trust-model": "move an arm that may be real although what it holds at rest is not the "
+    "weight that the model says",
+    "--excitation": "motion: random (default), or designed to teach most in the time",
+    "--duration": "default 30; where the arm moves slowly at first (excitation.slow_s), behind "
+    "that",
+    "--scenario": "of the simulated arm: nominal, bent_link, payload_at_20s, friction, "
+    "real_drives, wall_mounted (whose mounting is to be told: --gravity 9.81 0 0)",
+    "--set": "option of the scenario, as in --set mass=0.3 --set noise=none",
+    "--feedforward": "model that helps the controller (default none; for a designed motion "
+    "documented); its worth is told as tracking error",
+    "--view": "serve a page to watch the run on, on this machine alone (default port 8400, or "
+    "another where that is taken; 0: any)",
+    "--foxglove": "serve Foxglove's WebSocket protocol, which PlotJuggler takes too, on this "
+    "machine alone (default port 8765; needs panda-adapter[live])",
+    "--trust-log": "torques are as the model has them: what speaks against it is a warning",
+}
+
+
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Move an arm on smooth trajectories (or only listen) and learn λ and θ at its "
         "rate, in real time."
     )
-    add = parser.add_argument
-    add(
-        "--driver",
-        default="pybullet:panda",
-        metavar="ADDRESS",
-        help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=..., "
-        "ros2:///joint_states, FILE.py:CLASS of your own",
-    )
-    add(
-        "--allow-motion",
-        action="store_true",
-        help="leave to move an arm that may be real (fci, can, ros2): prints the plan, goes at a "
-        "tenth of the speed for 10 s, stops when this terminal closes. Without it, only listen",
-    )
+    add = declaring(parser, RUN_WORDS)
+    add("--driver", default="pybullet:panda", metavar="ADDRESS")
+    add("--allow-motion", action="store_true")
     add("--yes", action="store_true", help="move without being asked after the plan")
-    add(
-        "--trust-model",
-        action="store_true",
-        help="move an arm that may be real although what it holds at rest is not the weight that "
-        "the model says",
-    )
-    add(
-        "--excitation",
-        choices=KINDS,
-        help="motion: random (default), or designed to teach most in the time",
-    )
+    add("--trust-model", action="store_true")
+    add("--excitation", choices=KINDS)
     add_motion(parser)
-    add(
-        "--duration",
-        type=float,
-        default=30.0,
-        metavar="S",
-        help="default 30; where the arm moves slowly at first (excitation.slow_s), behind that",
-    )
-    add(
-        "--scenario",
-        metavar="NAME",
-        help="of the simulated arm: nominal, bent_link, payload_at_20s, friction, real_drives, "
-        "wall_mounted (whose mounting is to be told: --gravity 9.81 0 0)",
-    )
-    add(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="option of the scenario, as in --set mass=0.3 --set noise=none",
-    )
+    add("--duration", type=float, default=30.0, metavar="S")
+    add("--scenario", metavar="NAME")
+    add("--set", action="append", default=[], metavar="KEY=VALUE")
     add("--passive", action="store_true", help="only listen; do not move the arm")
     add("--fault", metavar="LIST", help="inject faults into the samples, as in lost=0.01,nan=0.001")
-    add(
-        "--feedforward",
-        choices=FEEDFORWARD,
-        help="model that helps the controller (default none; for a designed motion documented); "
-        "its worth is told as tracking error",
-    )
-    add(
-        "--view",
-        nargs="?",
-        type=_port,
-        const=ANY,
-        metavar="PORT",
-        help="serve a page to watch the run on, on this machine alone (default port 8400, or "
-        "another where that is taken; 0: any)",
-    )
-    add(
-        "--foxglove",
-        nargs="?",
-        type=_port,
-        const=DEFAULT_PORT,
-        metavar="PORT",
-        help="serve Foxglove's WebSocket protocol, which PlotJuggler takes too, on this machine "
-        "alone (default port 8765; needs panda-adapter[live])",
-    )
+    add("--feedforward", choices=FEEDFORWARD)
+    add("--view", nargs="?", type=_port, const=ANY, metavar="PORT")
+    add("--foxglove", nargs="?", type=_port, const=DEFAULT_PORT, metavar="PORT")
     add("--record", type=Path, metavar="FILE", help="default: in the results")
     add("--overwrite", action="store_true", help="replace an existing recording")
     add("--no-record", action="store_true", help="keep no recording")
-    add(
-        "--trust-log",
-        action="store_true",
-        help="torques are as the model has them: what speaks against it is a warning",
-    )
+    add("--trust-log", action="store_true")
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
     add_learning(parser)
     parser.set_defaults(check=_check)
@@ -185,6 +148,15 @@ def simulated(address: str) -> bool:
     return "interface=virtual" in query.split("&")
 
 
+EXCITE_WORDS = {
+    "--at": "where it starts, rad (default: where the first LOG does)",
+    "--std": "wanted, of the parameters of a body of 1 kg, 10 cm across, and of an effect's "
+    f"usual size (default {SHARE:g}: 0.2 kg, 0.02 kg m, 0.002 kg m², 0.2 N m of friction)",
+    "--noise": "standard deviation of each joint's torque, N m (default: of the LOGs, else 0.3 "
+    "%% of the effort limits)",
+}
+
+
 def declare_excite(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
@@ -194,27 +166,13 @@ def declare_excite(parser: argparse.ArgumentParser) -> None:
         "to be measured next. Writes it as CSV, as MCAP (trajectory_msgs/JointTrajectory) and as a "
         "page; nothing moves. `adapter run --excitation designed` moves an arm so."
     )
-    add = parser.add_argument
+    add = declaring(parser, EXCITE_WORDS)
     add("logs", nargs="*", type=Path, metavar="LOG", help="recordings of the arm that are there")
     add_robot(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML: [cell], [excitation], ...")
-    add(
-        "--at", metavar="Q1,Q2,...", help="where it starts, rad (default: where the first LOG does)"
-    )
-    add(
-        "--std",
-        type=float,
-        default=SHARE,
-        metavar="SHARE",
-        help="wanted, of the parameters of a body of 1 kg, 10 cm across, and of an effect's usual "
-        f"size (default {SHARE:g}: 0.2 kg, 0.02 kg m, 0.002 kg m², 0.2 N m of friction)",
-    )
-    add(
-        "--noise",
-        metavar="S1,S2,...",
-        help="standard deviation of each joint's torque, N m (default: of the LOGs, else 0.3 %% of "
-        "the effort limits)",
-    )
+    add("--at", metavar="Q1,Q2,...")
+    add("--std", type=float, default=SHARE, metavar="SHARE")
+    add("--noise", metavar="S1,S2,...")
     add("--gap", type=Path, metavar="FILE", help="JSON of `adapter gap`: what to measure next")
     add_motion(parser)
     add("--seed", type=int, help="of the motion")
@@ -237,46 +195,33 @@ def _check_excite(args: argparse.Namespace) -> None:
             raise UsageError(f"--{name} must be above {least:g}, got {getattr(args, name)}")
 
 
+REPLAY_WORDS = {
+    "logs": "recording (MCAP, rosbag2, ROS 1), or a folder of such; several of one arm are "
+    "learned from in order",
+    "--base": "the base floats, and this is its link (or one fixed to it); its motion is in the "
+    "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
+    "--base-wrench": "what pushes a floating base: zero in free motion; unknown (default), as "
+    "where it stands or hangs: only the joints' torques are learned from",
+    "--imu": "an Imu glued on a link, anyhow; may be repeated. Needed where the messages' frame "
+    "does not name the link; none: take no notice of any",
+}
+
+
 def declare_replay(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Learn λ and θ from an MCAP recording, sample by sample as the live process does (the "
         "result is the same), or in batches."
     )
-    add = parser.add_argument
-    add(
-        "logs",
-        nargs="+",
-        type=Path,
-        metavar="LOG",
-        help="recording (MCAP, rosbag2, ROS 1), or a folder of such; several of one arm are "
-        "learned from in order",
-    )
+    add = declaring(parser, REPLAY_WORDS)
+    add("logs", nargs="+", type=Path, metavar="LOG")
     add_topic(parser)
     add_learning(parser)
     add_told(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
-    add(
-        "--base",
-        metavar="LINK",
-        help="the base floats, and this is its link (or one fixed to it); its motion is in the "
-        "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
-    )
-    add(
-        "--base-wrench",
-        choices=("zero", "unknown"),
-        default="unknown",
-        help="what pushes a floating base: zero in free motion; unknown (default), as where it "
-        "stands or hangs: only the joints' torques are learned from",
-    )
-    add(
-        "--imu",
-        action="append",
-        default=[],
-        metavar="TOPIC=LINK",
-        help="an Imu glued on a link, anyhow; may be repeated. Needed where the messages' frame "
-        "does not name the link; none: take no notice of any",
-    )
+    add("--base", metavar="LINK")
+    add("--base-wrench", choices=("zero", "unknown"), default="unknown")
+    add("--imu", action="append", default=[], metavar="TOPIC=LINK")
     held_out = parser.add_mutually_exclusive_group()
     held_out.add_argument("--validate", type=Path, metavar="LOG", help="score on this recording")
     held_out.add_argument(
