@@ -6,22 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from adapter.cli.options import (
-    NAMES,
-    add_json,
-    add_learning,
-    add_motion,
-    add_robot,
-    add_told,
-    add_topic,
-    check_files,
-    check_learning,
-    check_logs,
-    check_robot,
-    check_told,
-    declaring,
-    numbers,
-)
+from adapter.cli import options
 from adapter.control.settings import DESIGNED, KINDS
 from adapter.errors import UsageError
 from adapter.model.robot_names import robot_names
@@ -65,13 +50,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "Move an arm on smooth trajectories (or only listen) and learn λ and θ at its "
         "rate, in real time."
     )
-    add = declaring(parser, RUN_WORDS)
+    add = options.declaring(parser, RUN_WORDS)
     add("--driver", default="pybullet:panda", metavar="ADDRESS")
     add("--allow-motion", action="store_true")
     add("--yes", action="store_true", help="move without being asked after the plan")
     add("--trust-model", action="store_true")
     add("--excitation", choices=KINDS)
-    add_motion(parser)
+    options.add_motion(parser)
     add("--duration", type=float, default=30.0, metavar="S")
     add("--scenario", metavar="NAME")
     add("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -85,7 +70,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--no-record", action="store_true", help="keep no recording")
     add("--trust-log", action="store_true")
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
-    add_learning(parser)
+    options.add_learning(parser)
     parser.set_defaults(check=_check)
 
 
@@ -112,7 +97,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--duration must be above zero, got {args.duration}")
     scheme, rest = split_address(args.driver)
     if is_own(scheme):
-        check_files(Path(scheme))
+        options.check_files(Path(scheme))
     elif scheme not in SCHEMES:
         raise UsageError(f"no driver '{scheme}'; {choices(scheme, SCHEMES, OWN_KIND)}")
     if scheme == "pybullet" and rest not in SIMULATED:
@@ -131,9 +116,9 @@ def _check(args: argparse.Namespace) -> None:
             f"an arm behind {args.driver} does not say which robot it is; --robot must, before it "
             f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"
         )
-    check_learning(args)
+    options.check_learning(args)
     if args.fault is not None or args.scenario or args.set:
-        import_module(NAMES).check_run(args)
+        import_module(options.NAMES).check_run(args)
 
 
 def simulated(address: str) -> bool:
@@ -166,30 +151,30 @@ def declare_excite(parser: argparse.ArgumentParser) -> None:
         "to be measured next. Writes it as CSV, as MCAP (trajectory_msgs/JointTrajectory) and as a "
         "page; nothing moves. `adapter run --excitation designed` moves an arm so."
     )
-    add = declaring(parser, EXCITE_WORDS)
+    add = options.declaring(parser, EXCITE_WORDS)
     add("logs", nargs="*", type=Path, metavar="LOG", help="recordings of the arm that are there")
-    add_robot(parser)
+    options.add_robot(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML: [cell], [excitation], ...")
     add("--at", metavar="Q1,Q2,...")
     add("--std", type=float, default=SHARE, metavar="SHARE")
     add("--noise", metavar="S1,S2,...")
     add("--gap", type=Path, metavar="FILE", help="JSON of `adapter gap`: what to measure next")
-    add_motion(parser)
+    options.add_motion(parser)
     add("--seed", type=int, help="of the motion")
     add("--longest", type=float, default=LONGEST_S, metavar="S", help=f"default {LONGEST_S:g}")
     said = f"of points (default {RATE_HZ:g})"
     add("--rate", type=float, default=RATE_HZ, metavar="HZ", help=said)
-    add_json(parser)
+    options.add_json(parser)
     add("--out", type=Path, metavar="FOLDER", help="where results go")
     parser.set_defaults(check=_check_excite, excitation=DESIGNED)
 
 
 def _check_excite(args: argparse.Namespace) -> None:
-    check_robot(args.robot)
-    check_files(args.config, args.gap)
-    args.logs = check_logs(*args.logs)
-    args.at = numbers("--at", args.at, what="numbers")
-    args.noise = numbers("--noise", args.noise)
+    options.check_robot(args.robot)
+    options.check_files(args.config, args.gap)
+    args.logs = options.check_logs(*args.logs)
+    args.at = options.numbers("--at", args.at, what="numbers")
+    args.noise = options.numbers("--noise", args.noise)
     for name, least in (("std", 0.0), ("longest", 1.0), ("rate", 1.0)):
         if not getattr(args, name) > least:
             raise UsageError(f"--{name} must be above {least:g}, got {getattr(args, name)}")
@@ -213,11 +198,11 @@ def declare_replay(parser: argparse.ArgumentParser) -> None:
         "Learn λ and θ from an MCAP recording, sample by sample as the live process does (the "
         "result is the same), or in batches."
     )
-    add = declaring(parser, REPLAY_WORDS)
+    add = options.declaring(parser, REPLAY_WORDS)
     add("logs", nargs="+", type=Path, metavar="LOG")
-    add_topic(parser)
-    add_learning(parser)
-    add_told(parser)
+    options.add_topic(parser)
+    options.add_learning(parser)
+    options.add_told(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
     add("--base", metavar="LINK")
     add("--base-wrench", choices=("zero", "unknown"), default="unknown")
@@ -235,9 +220,9 @@ def _check_replay(args: argparse.Namespace) -> None:
         raise UsageError("--every needs mode moments; have: --mode moments, or --every 1")
     alone = {"--base": args.base, "--imu": args.imu, "--validate-from": args.validate_from}
     given = [option for option, value in alone.items() if value]
-    args.logs = check_logs(*args.logs)
+    args.logs = options.check_logs(*args.logs)
     if given and len(args.logs) > 1:
         raise UsageError(f"{', '.join(given)} go with one LOG, not with several")
-    check_told(args)
-    check_learning(args)
-    check_logs(args.validate)
+    options.check_told(args)
+    options.check_learning(args)
+    options.check_logs(args.validate)
