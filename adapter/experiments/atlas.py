@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.baselines.compare import Errors, arm_tables, choices, compare
+from adapter.experiments.baselines import presets
+from adapter.experiments.baselines.compare import Errors, arm_tables, compare
+from adapter.experiments.baselines.features import Columns, sub_chain, sub_parents
 from adapter.experiments.falls import Falls, gathered, sets_of
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
 from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
@@ -108,27 +110,23 @@ class Judged:
     training: KinematicErrors
 
 
-class _Judge:
-    """Gathers errors of one body, trajectory by trajectory."""
-
-    def __init__(self, body: Body, joints: int, arm: Sequence[int]) -> None:
-        self._body, self._n, self._arm = body, joints, list(arm)
-        self._whole, self._part = Errors(joints), Errors(len(self._arm))
-        self._kinematics: list[KinematicErrors] = []
-
-    def add(self, data: TreeData, rows: dict[str, np.ndarray]) -> None:
-        """A trajectory, and its rows by set."""
-        estimate = predicted_torques(data, self._body.lam, self._body.theta.theta)[:, -self._n :]
-        for name, own in rows.items():
-            tau = data.tau[own][:, -self._n :]
-            self._whole.add(name, tau, estimate[own])
-            self._part.add(name, tau[:, self._arm], estimate[own][:, self._arm])
-        if "control" in rows:
-            self._kinematics.append(kinematic_errors(data, self._body.lam))
-
-    def verdict(self, learned_from: TreeData) -> Judged:
-        """All of it."""
-        body = self._body
+def judge(
+    bodies: Sequence[Body], learned_from: TreeData, source: Falls, parts: Split
+) -> list[Judged]:
+    """Torques on every sample, of all joints and of the arm's; link motion on the control set."""
+    n, arm = learned_from.tree.n, list(ARM)
+    errors = [(body, Errors(n), Errors(len(arm)), list[KinematicErrors]()) for body in bodies]
+    for data, rows in sets_of(source, parts):
+        for body, whole, part, kinematics in errors:
+            estimate = predicted_torques(data, body.lam, body.theta.theta)[:, -n:]
+            for name, own in rows.items():
+                tau = data.tau[own][:, -n:]
+                whole.add(name, tau, estimate[own])
+                part.add(name, tau[:, arm], estimate[own][:, arm])
+            if "control" in rows:
+                kinematics.append(kinematic_errors(data, body.lam))
+    judged = []
+    for body, whole, part, kinematics in errors:
         how = "mini-batches" if body.name == "FOPnet" else "second moments"
         title = f"First-order-principles networks, λ from {how}"
         learned = LearnerScores(body.name, title, train_s=body.learning_s)
@@ -138,26 +136,10 @@ class _Judge:
             f"θ over bodies that can exist, {len(body.theta.stages)} sub-problems in "
             f"{body.theta_s:.1f} s",
         ]
-        arm = LearnerScores(f"{body.name}, arm", title, train_s=body.learning_s)
+        of_arm = part.into(LearnerScores(f"{body.name}, arm", title, train_s=body.learning_s))
         training = kinematic_errors(learned_from, body.lam)
-        return Judged(
-            body,
-            self._whole.into(learned),
-            self._part.into(arm),
-            _worst(self._kinematics),
-            training,
-        )
-
-
-def judge(
-    bodies: Sequence[Body], learned_from: TreeData, source: Falls, parts: Split, arm: Sequence[int]
-) -> list[Judged]:
-    """Torques on every sample, of all joints and of an arm's; link motion on the control set."""
-    judges = [_Judge(body, learned_from.tree.n, arm) for body in bodies]
-    for data, rows in sets_of(source, parts):
-        for one in judges:
-            one.add(data, rows)
-    return [one.verdict(learned_from) for one in judges]
+        judged.append(Judged(body, whole.into(learned), of_arm, _worst(kinematics), training))
+    return judged
 
 
 def _worst(parts: list[KinematicErrors]) -> KinematicErrors:
@@ -221,7 +203,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     say(f"learning λ and θ from {len(data)} samples")
     networks, *bodies = learn_bodies(data, args.seed)
     say("judging all samples")
-    by_networks, by_moments = judge(bodies, data, source, parts, ARM)
+    by_networks, by_moments = judge(bodies, data, source, parts)
     say("learning from noisy sensors")
     noisy_parts = split(count * [len(source.measured(0))], args.seed)
     noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
@@ -279,9 +261,10 @@ def _baselines(
     tree = source.tree
     joints = [tree.joint_names[j] for j in ARM]
     carrier = tree.link_names[tree.parent[ARM[0]]]
+    index = sub_chain(tree, joints, carrier)
+    arm = Columns(len(index)), sub_parents(tree, index), source.truth.lam[index]
     sets = arm_tables(source, parts, joints, carrier)
-    chosen = choices(tree, source.truth.lam, joints, carrier, args.full, args.seed)
-    return compare(sets, chosen, args.seed, say)
+    return compare(sets, presets.learners(*arm, args.full, args.seed), args.seed, say)
 
 
 # --- every number of the experiment under a key of its own --------------------------------------

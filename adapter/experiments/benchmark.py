@@ -11,8 +11,7 @@ import os
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -107,11 +106,12 @@ def _row(what: str, times_ns: list[int] | None, note: str) -> dict[str, Any]:
     return {"what": what, "p50_us": float(p50), "p99_us": float(p99), "note": note}
 
 
-def _timed(step: Callable[[int], object], repeats: int) -> list[int]:
+def _timed(step: Callable[[Any], object], over: Iterable[Any]) -> list[int]:
+    """ns of a step on each of these."""
     times = []
-    for k in range(repeats):
+    for x in over:
         before = time.perf_counter_ns()
-        step(k)
+        step(x)
         times.append(time.perf_counter_ns() - before)
     return times
 
@@ -122,10 +122,10 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
     samples = [JointSample(1_000_000 * k, q[k], dq[k], tau[k]) for k in range(WARM_UP + repeats)]
     states: list[Array] = []
 
-    def tick(k: int) -> None:
-        states.extend(front_end.step(samples[k]).copy())
+    def tick(sample: JointSample) -> None:
+        states.extend(front_end.step(sample).copy())
 
-    ticks = _timed(tick, WARM_UP + repeats)[WARM_UP:]
+    ticks = _timed(tick, samples)[WARM_UP:]
     rows = [_row("front end: checks, filter, twist synthesis", ticks, "per sample")]
     gain = JointFilter().noise_gain
     for effects, note in (((), "λ and θ"), (REAL_ARM_EFFECTS, "λ, θ and a real arm's effects")):
@@ -133,16 +133,11 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
         learner = OnlineLearner(robot.tree, robot.gravity, settings, Filtered(noise_gain=gain))
         for state in states[: WARM_UP // 2]:
             learner.step(state)
-        rest = states[WARM_UP // 2 :]
-        times = _timed(partial(_learn, learner, rest), len(rest))
+        times = _timed(learner.step, states[WARM_UP // 2 :])
         if learner.theta_started_ns is None:
             note += " (θ had not begun)"
         rows.append(_row("our update from the moments of all samples", times[-repeats:], note))
     return rows
-
-
-def _learn(learner: OnlineLearner, states: list[Array], k: int) -> None:
-    learner.step(states[k])
 
 
 def _autograd(robot: SelfModel, repeats: int) -> dict[str, Any]:
@@ -167,7 +162,8 @@ def _autograd(robot: SelfModel, repeats: int) -> dict[str, Any]:
         (cost + ((hat - tau[at]) ** 2).sum()).backward()
         adam.step()
 
-    return _row("autograd through the torch networks, ADAM", _timed(step, repeats), "one sample")
+    times = _timed(step, range(repeats))
+    return _row("autograd through the torch networks, ADAM", times, "one sample")
 
 
 def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
@@ -191,7 +187,7 @@ def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
         theta = theta + gain @ (tau[k] - Y @ theta)
         P = P - gain @ PY.T
 
-    return _row(what, _timed(step, repeats), "θ alone, no λ, no physical consistency")
+    return _row(what, _timed(step, range(repeats)), "θ alone, no λ, no physical consistency")
 
 
 def _peer(repeats: int) -> dict[str, Any]:
@@ -219,7 +215,7 @@ def _peer(repeats: int) -> dict[str, Any]:
         ((hat - tau) ** 2).sum().backward()
         adam.step()
 
-    return _row(what, _timed(step, repeats), "one sample, link masses alone")
+    return _row(what, _timed(step, range(repeats)), "one sample, link masses alone")
 
 
 # --- torque of a log that none of the ways to learn has seen --------------------------------------
