@@ -17,7 +17,7 @@ from adapter.report.fleet_words import (
     to_be_shown,
 )
 from adapter.report.html import fill, write_whole
-from adapter.report.style import MUTED, Drawing, Panel, joint_color
+from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
 from adapter.report.words import with_doubt
 from adapter.runs.fleet.arm import DAY_S, FleetArm, OfLog
@@ -85,14 +85,7 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
             )
             look = ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)
             look.set_label(str(j + 1))
-        ax.legend(
-            ncols=8,
-            fontsize=6,
-            frameon=False,
-            labelcolor=MUTED,
-            loc="lower center",
-            bbox_to_anchor=(0.5, 0.98),
-        )
+        legend(ax, ncols=8, fontsize=6, loc="lower center", bbox_to_anchor=(0.5, 0.98))
         drawing.figure.subplots_adjust(top=0.9)  # for the legend
         ax.set_xlabel(label)
         effect = KNOWN[name]

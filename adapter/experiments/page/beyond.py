@@ -21,6 +21,7 @@ from adapter.report.style import (
     SIZES,
     Drawing,
     Panel,
+    legend,
     level,
     log_axis,
     time_axis,
@@ -150,8 +151,6 @@ def _plot(t: Array, lines: Sequence[Line], goal: float | None) -> Drawing:
     ax.set_xlim(0.0, 1.04 * float(t[-1]))
     if goal is not None:
         level(ax, goal, f"goal {scientific(goal)}", left=True)
-    ax.legend(
-        frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="upper right", ncols=2
-    )
+    legend(ax, fontsize=SIZES["half"][2], loc="upper right", ncols=2)
     time_axis(drawing, SECONDS)
     return drawing
