@@ -148,7 +148,7 @@ def _check_fleet(args: argparse.Namespace) -> None:
 
 LOAD_WORDS = {
     "--inertia-prior": "standard deviation of the model's inertial numbers, of their size "
-    "(default 0.05; 0.2 with --empty)",
+    "(default 0.05; 0.2 with --empty)"
 }
 
 

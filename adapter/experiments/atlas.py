@@ -37,7 +37,6 @@ from adapter.runs.outcome import frame_errors
 from adapter.runs.terminal import console
 from sim.falls.data_set import Flight, data_set
 
-SOLVER_NAMES = {"consistent": "interior point (Clarabel)"}
 ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
@@ -279,7 +278,7 @@ def _learning(
     return {
         "minibatch": settings.minibatch,
         "cycles": settings.cycles,
-        "theta_solver": SOLVER_NAMES[BatchThetaSettings().solver],
+        "theta_solver": "interior point (Clarabel)",
         "kinematic_error_max": by_moments.kinematics.largest,
         "kinematic_error_max_networks": by_networks.kinematics.largest,
         "kinematic_error_max_training": by_moments.training.largest,
@@ -338,7 +337,6 @@ def _comparison(learners: Sequence[LearnerScores], arms: Sequence[LearnerScores]
 
 # --- the 1 kHz learner on the whole robot --------------------------------------------------------
 
-HELD_OUT_EVERY = 10  # samples
 LOOK_EVERY = 5000  # samples between two looks at the errors
 PAUSE_NS = 1_000_000_000  # between two motions
 # Noise of signals behind a filter, standard deviations: rad, rad/s, rad/s² of joints; rad/s,
@@ -417,7 +415,7 @@ def online_trial(
     Returns:
         The figures (times in µs and s), and the learner.
     """
-    test = test.take(slice(None, None, HELD_OUT_EVERY))
+    test = test.take(slice(None, None, 10))
     learner = OnlineLearner(test.tree, settings=SETTINGS)
     seen = frame_observability(learner.tree, true_lam, gravity_down())
     times_ns: list[int] = []

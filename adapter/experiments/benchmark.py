@@ -29,11 +29,7 @@ from adapter.model.inertia import log_cholesky_from_theta
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.networks import (
-    inverse_dynamics,
-    link_motion,
-    theta_from_log_cholesky_torch,
-)
+from adapter.physics.networks import inverse_dynamics, link_motion, theta_from_log_cholesky_torch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.library import find_gap, learn
 from adapter.runs.pipeline import make_front_end
@@ -46,7 +42,6 @@ from drivers.files.mcap import Log, read_log
 from drivers.interface import JointSample
 
 WARM_UP = 2500  # samples, so that λ has settled and θ is being learned
-LEAST_REPEATS = 10
 MOST_SLOW_REPEATS = 100
 # Torque RMSE of joints 1 to 7, N m, that figaroh 1.0.2 leaves of the log of a real Panda (Gaz et
 # al. 2019) after 14 s, learned before; measured by `adapter bench --log`.
@@ -59,7 +54,7 @@ Signals = tuple[Array, Array, Array, Array]
 
 def run(args: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
-    rows = benchmark(max(args.repeats, LEAST_REPEATS))
+    rows = benchmark(max(args.repeats, 10))
     table = Table("what", "p50 µs", "p99 µs", "note", box=None, pad_edge=False)
     for row in rows:
         p50, p99 = row["p50_us"], row["p99_us"]

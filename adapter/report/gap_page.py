@@ -23,7 +23,6 @@ from adapter.report.tables import Tile
 from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
 from adapter.report.words import NARROW, capital
 
-TEMPLATE = "gap.html"
 WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
 OURS = (  # how clauses begin that are words of ours, no names
@@ -37,7 +36,7 @@ def render_gap_page(result: GapResult, folder: Path | None = None) -> str:
 
     `folder`: where the page and the result's figures are, for commands that take these.
     """
-    return fill(TEMPLATE, context(result, folder))
+    return fill("gap.html", context(result, folder))
 
 
 def write_gap_page(result: GapResult, path: str | Path) -> Path:

@@ -23,14 +23,10 @@ from adapter.report.style import (
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
-DASHES: tuple[tuple[float, Sequence[float]], ...] = (  # x, y, z
-    (0, ()),
-    (0, (4, 1.5)),
-    (0, (1, 1.3)),
-)
+DASHES: Sequence[tuple[float, Sequence[float]]] = ((0, ()), (0, (4, 1.5)), (0, (1, 1.3)))  # x, y, z
 SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time to converge
 FIRST_S = 0.05  # left end of a logarithmic time axis
-LOWEST = {"rad": 1e-5, "m": 1e-5}  # of an error that is shown; below it a line leaves the panel
+LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
 SETTLED = "inside both goals"
 
 
@@ -104,8 +100,8 @@ def _errors(t: Array, error: Array, goal: float, unit: str, converged: float | N
     ax = drawing.axes[0]
     top = max(float(error.max()), 10 * goal)
     shown = t >= FIRST_S
-    lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST[unit]))
-    log_axis(ax, LOWEST[unit], 2 * top)
+    lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST))
+    log_axis(ax, LOWEST, 2 * top)
     log_time(ax, FIRST_S, t[-1])
     late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
     level(ax, goal, f"goal {goal:g} {unit}", left=late)

@@ -36,15 +36,7 @@ SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the pane
 FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
 GROUPS = (("kg", (0,)), ("kg m", (1, 2, 3)), ("kg m²", (4, 7, 9, 5, 6, 8)))  # of ten parameters
 COLOR_OF = (7, 0, 1, 2, 0, 3, 4, 1, 5, 2)  # of each parameter, as of a joint of that number
-BODY_PARTS = (
-    (8, "m"),
-    (1, "mX, XX"),
-    (2, "mY, YY"),
-    (3, "mZ, ZZ"),
-    (4, "XY"),
-    (5, "XZ"),
-    (6, "YZ"),
-)
+BODY_PARTS = ((8, "m"), *enumerate(("mX, XX", "mY, YY", "mZ, ZZ", "XY", "XZ", "YZ"), start=1))
 MOST_ROWS = 160  # along a line of a small panel
 
 

@@ -11,7 +11,6 @@ from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
 from adapter.model.spatial import Array
 
 UNITS = 1000  # the paper's
-BATCH = 200  # samples
 # (share of the epochs, share of ADAM's first rate): constant rates leave the loss where their
 # noise is.
 SCHEDULE = ((0.35, 1.0), (0.3, 0.5), (0.2, 0.15), (0.15, 0.05))
@@ -26,7 +25,7 @@ class FeedForward(ScaledBaseline):
         self,
         units: int = UNITS,
         epochs: int = 120,
-        batch: int = BATCH,
+        batch: int = 200,
         rate: float = 2e-3,
         seed: int = 0,
     ) -> None:

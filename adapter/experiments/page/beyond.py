@@ -56,10 +56,14 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
     if not robots:
         return None
     trials = [found for _, found in robots]
+    wrong = [found["most_confidence_wrong"] for found in trials]
     rows: list[tuple[str, list[str]]] = [
         ("trees found, every edge right", [f"{x['right']} of {x['trials']}" for x in trials]),
         ("least confidence in a right edge", [_share(x["least_confidence_right"]) for x in trials]),
-        ("most confidence in a wrong edge", [_wrong(x["most_confidence_wrong"]) for x in trials]),
+        (
+            "most confidence in a wrong edge",
+            [_share(x) if x > 0.0 else "none was reported" for x in wrong],
+        ),
         ("longest recording", [with_unit(x["motion_s"], "s", 3) for x in trials]),
         ("measured on every link", [_channels(x["measured"]) for x in trials]),
     ]
@@ -69,10 +73,6 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
 def _share(confidence: float) -> str:
     """Never rounded up to certainty."""
     return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
-
-
-def _wrong(confidence: float) -> str:
-    return _share(confidence) if confidence > 0.0 else "none was reported"
 
 
 def _channels(measured: str) -> str:

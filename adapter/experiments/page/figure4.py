@@ -135,11 +135,7 @@ def epoch_panels(atlas: AtlasResults) -> list[Panel]:
 
 
 def draw_bones(
-    ax: Axes,
-    tree: Tree,
-    shown: Skeleton,
-    behind: bool = False,
-    only: Sequence[int] | None = None,
+    ax: Axes, tree: Tree, shown: Skeleton, behind: bool = False, only: Sequence[int] | None = None
 ) -> None:
     """Lines from each parent's origin to the joint's, and a dot there."""
     color = {j: joint_color(limb.color) for limb in limbs(tree) for j in limb.joints}

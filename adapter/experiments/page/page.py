@@ -20,8 +20,6 @@ from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW
 
-TEMPLATE = "experiment.html"
-NOT_STATED = "not stated"
 PAPER_LEARNERS = (
     ("a", "the feed-forward network"),
     ("b", "the committee of extreme learning machines"),
@@ -41,7 +39,7 @@ def render_experiment(atlas: AtlasResults | None, panda: PandaResults | None, wr
     Raises:
         ValueError: results whose shapes do not fit their tree.
     """
-    return fill(TEMPLATE, context(atlas, panda, written), "adapter.experiments")
+    return fill("experiment.html", context(atlas, panda, written), "adapter.experiments")
 
 
 def write_experiment(
@@ -196,9 +194,7 @@ def _atlas_reasons(atlas: AtlasResults) -> list[str]:
 
 def stated_table(items: Sequence[Stated]) -> Table | None:
     """What the paper states, what we measured, what differs; None without any."""
-    rows = [
-        [item.what, item.paper or NOT_STATED, words.ours_text(item), item.note] for item in items
-    ]
+    rows = [[x.what, x.paper or "not stated", words.ours_text(x), x.note] for x in items]
     return Table(["", "Paper states", "We measured", "Remark"], rows) if rows else None
 
 
