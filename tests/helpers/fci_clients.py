@@ -130,18 +130,22 @@ class Watch:
             self.late = self.late or now_ms > before_ms + 1 or self._last[1] - before_s > LATE_S
 
 
-class Panda:
-    """panda-python's Robot."""
+class Connected:
+    """A connection by one of the vendor's libraries, which are much alike."""
 
-    def __init__(self) -> None:
-        self.watch = Watch()
-        import panda_py
-
-        self.lib = panda_py.libfranka
-        self.robot = self.lib.Robot("127.0.0.1", self.lib.RealtimeConfig.kIgnore)
+    def __init__(self, lib) -> None:
+        self.watch, self.lib = Watch(), lib
+        self.robot = lib.Robot("127.0.0.1", lib.RealtimeConfig.kIgnore)
 
     def state(self):
         return self.robot.read_once()
+
+
+class Panda(Connected):
+    """panda-python's Robot."""
+
+    def __init__(self) -> None:
+        super().__init__(importlib.import_module("panda_py").libfranka)
 
     def millisecond(self, state) -> int:
         return state.time.to_msec()
@@ -185,18 +189,11 @@ class Panda:
         self.robot.control_joint_position(control, mode, False, 1000.0)
 
 
-class FR3:
+class FR3(Connected):
     """pylibfranka's Robot."""
 
     def __init__(self) -> None:
-        self.watch = Watch()
-        import pylibfranka
-
-        self.lib = pylibfranka
-        self.robot = self.lib.Robot("127.0.0.1", self.lib.RealtimeConfig.kIgnore)
-
-    def state(self):
-        return self.robot.read_once()
+        super().__init__(importlib.import_module("pylibfranka"))
 
     def millisecond(self, state) -> int:
         return round(1000 * state.time.to_sec())
