@@ -45,13 +45,7 @@ def demand(protocol: int) -> None:
 
 
 @contextlib.contextmanager
-def robot(
-    protocol: int,
-    *faults: str,
-    seed: int = 3,
-    patience_s: float = PATIENCE_S,
-    more: tuple[str, ...] = (),
-):
+def robot(protocol: int, *faults: str, patience_s: float = PATIENCE_S, more: tuple[str, ...] = ()):
     """A simulated robot on the port that the clients know, with more of its options; one at a time
     on a machine.
 
@@ -62,8 +56,7 @@ def robot(
         options = [word for fault in faults for word in ("--fault", fault)]
         command = [
             sys.executable, "-m", "adapter", "sim", "fci", "--protocol", str(protocol),
-            "--seed", str(seed),
-            "--json", str(summary), "--patience", str(patience_s), *options, *more,
+            "--seed", "3", "--json", str(summary), "--patience", str(patience_s), *options, *more,
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])
         try:

@@ -13,7 +13,6 @@ import pytest
 from adapter.effects.export import robot_urdf, to_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
-from adapter.model.inertia import is_consistent, min_eigenvalue
 from adapter.model.model_file import dumps, loads
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
@@ -226,16 +225,6 @@ def test_links_that_ride_keep_their_weight_while_their_carrier_can_exist(mass: f
         assert "camera" in written.notes[0] and "times as heavy" in written.notes[0]
     found = re.findall(r'<mass value ?= ?"([^"]*)"', written.text)
     assert min(float(x) for x in found if float(x)) > 0.01
-
-
-def test_an_impossible_body_is_refused() -> None:
-    model = read_quietly(DRESSED)
-    theta = model.theta.copy()
-    theta[1, 4] = 1.0
-    assert not is_consistent(theta)
-    assert min_eigenvalue(theta[1]) < 0.0
-    with pytest.raises(ModelError, match=r"'b' is physically impossible"):
-        robot_urdf(replace(model, theta=theta))
 
 
 CHANGED = {
