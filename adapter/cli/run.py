@@ -13,7 +13,7 @@ from functools import partial
 from glob import escape
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from adapter import optional
 from adapter.cli.agreement import agree, need_somebody, reading
@@ -71,11 +71,19 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import joint_count, maybe_real, open_driver, split_address
 
-if TYPE_CHECKING:
-    from adapter.cli.simulated import Simulation
-
 DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
+
+
+class SimulationLike(Protocol):
+    """A simulated arm (`adapter.cli.simulated.Simulation`)."""
+
+    scenario: Any
+    asked_for: bool
+
+    def driver(self, rest: str) -> Driver:
+        """What opens it."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +101,7 @@ class RunPlan:
 
     robot: SelfModel
     config: Config
-    world: Simulation | None
+    world: SimulationLike | None
     maybe_real: bool
     feedforward: str
 
@@ -198,7 +206,7 @@ def _accounts(result: LiveResult) -> list[str]:
     return result.timing.lines() + ([] if commands is None else [commands.line()])
 
 
-def _write_truth(world: Simulation | None, folder: Path) -> Path | None:
+def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
     """Write the scenario's truth; errors are against it where a scenario was asked for."""
     if world is None:
         return None

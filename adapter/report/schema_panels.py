@@ -53,10 +53,9 @@ def schema_panels(data: RunData) -> list[Panel]:
     ]
     if data.reference is None:
         return panels
-    turn, shift = data.schema_errors
     goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")
     titles = "Orientation error", "Position error"
-    for title, error, (goal, unit) in zip(titles, (turn, shift), goals, strict=True):
+    for title, error, (goal, unit) in zip(titles, data.schema_errors, goals, strict=True):
         drawing = _errors(t, error, goal, unit, converged)
         panels.append(drawing.panel(title, unit, "in what the data had shown by then"))
     return panels
@@ -88,8 +87,7 @@ def _components(t: Array, values: Array, converged: float | None) -> Drawing:
             line.set_linestyle(dashes)
     ax.set_xlim(min(0.0, t[0]), t[-1])
     ax.margins(y=0.12)  # room for the words of the mark
-    if converged is not None:
-        mark(ax, converged, SETTLED)
+    mark(ax, converged, SETTLED)
     time_axis(drawing)
     return drawing
 
@@ -105,7 +103,6 @@ def _errors(t: Array, error: Array, goal: float, unit: str, converged: float | N
     log_time(ax, FIRST_S, t[-1])
     late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
     level(ax, goal, f"goal {goal:g} {unit}", left=late)
-    if converged is not None:
-        mark(ax, converged, SETTLED)
+    mark(ax, converged, SETTLED)
     time_axis(drawing)
     return drawing

@@ -207,10 +207,11 @@ def power_of_ten(value: float) -> str:
     return "10" + str(round(float(np.log10(value)))).translate(SUPERSCRIPTS)
 
 
-def mark(ax: Axes, x: float, text: str, top: float = 0.98) -> None:
-    """A vertical line in time with words at its top, or lower (as a share of the height)."""
+def mark(ax: Axes, x: float | None, text: str, top: float = 0.98) -> None:
+    """A vertical line in time with words at its top, or lower (as a share of the height); none
+    where the time is unknown or not shown."""
     low, high = ax.get_xlim()
-    if not low <= x <= high:
+    if x is None or not low <= x <= high:
         return
     ax.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
     share = ax.transAxes.inverted().transform(ax.transData.transform((x, ax.get_ylim()[1])))[0]

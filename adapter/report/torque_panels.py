@@ -145,9 +145,7 @@ def _against_batch(data: RunData) -> Panel:
         usual = float(np.median(ours[t >= 0.5 * (t[0] + t[-1])]))
         ax.set_ylim(0.0, max(SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()), 1.5 * usual))
     _finish(drawing, t, data)
-    converged = data.converged_s("theta")
-    if converged is not None:
-        mark(ax, converged, f"inside {TORQUE_GOAL:g} × batch", top=0.88)
+    mark(ax, data.converged_s("theta"), f"inside {TORQUE_GOAL:g} × batch", top=0.88)
     return drawing.panel(
         "Prequential torque error",
         "in units of the noise",

@@ -137,6 +137,5 @@ def _finish(drawing: Drawing, t: Array, panda: PandaResults) -> None:
         log_time(ax, FIRST_S, last)
     else:
         ax.set_xlim(0.0, last)
-    if np.isfinite(panda.theta_start_s):
-        mark(ax, panda.theta_start_s, "θ starts")
+    mark(ax, panda.theta_start_s, "θ starts")
     time_axis(drawing)
