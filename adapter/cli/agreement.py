@@ -6,18 +6,16 @@ import argparse
 import select
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import plan_lines
-from adapter.control.free_path import ArmInCell, Clearance, FreeMotion
-from adapter.control.limits import MotionLimits
-from adapter.control.path_motion import PathMotion
+from adapter.control.free_path import FreeMotion
 from adapter.control.push_bound import push_bound
 from adapter.errors import SettingsError, UsageError
-from adapter.report.plan_page import PlanWords, write_plan
+from adapter.report.plan_page import Plan
 from adapter.runs.terminal import say
 from drivers.interface import Driver
 
@@ -50,20 +48,6 @@ def reading(driver: Driver) -> Callable[[], None]:
     return read
 
 
-def whole_plan(
-    arm: ArmInCell,
-    motion: PathMotion,
-    limits: MotionLimits,
-    duration_s: float,
-    least: Clearance,
-    more: Sequence[str] = (),
-) -> list[str]:
-    """Lines of a motion, with what it comes nearest to and more of its kind before the last."""
-    lines = plan_lines(motion, limits, arm.model.tree.joint_names, duration_s)
-    nearest = f"Nearest on the way: {least} (margin {arm.cell.margin:g} m)."
-    return [*lines[:-1], nearest, *more, lines[-1]]
-
-
 def agree(
     args: argparse.Namespace,
     driver: Driver,
@@ -85,16 +69,13 @@ def agree(
     draw, motion, start = controller.draw, controller.reference, controller.start
     assert isinstance(draw, FreeMotion) and draw.least is not None
     assert motion is not None and start is not None
-    limits, least = controller.limits, draw.least
     if controller.weight is not None and controller.weight.refusal is not None:
         raise SettingsError(controller.weight.refusal)
-    bound = push_bound(draw.arm.model, motion, limits, controller.safety)
-    lines = whole_plan(draw.arm, motion, limits, duration_s, least, bound.lines())
+    bound = push_bound(draw.arm.model, motion, controller.limits, controller.safety)
+    plan = Plan(draw.arm, motion, controller.limits, draw.least)
+    lines = plan.lines(duration_s, bound.lines())
     say("\n".join(lines))
-
-    def write() -> Path:
-        return write_plan(folder / PLAN_PAGE, draw.arm, motion, limits, least, PlanWords(lines))
-
+    write = partial(plan.write, folder / PLAN_PAGE, lines)
     if args.yes:  # nobody looks at it now, and the arm's samples do not wait
         return write
     with ThreadPoolExecutor(1) as pool:

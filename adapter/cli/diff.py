@@ -8,15 +8,7 @@ from dataclasses import replace
 from rich.table import Table
 
 from adapter.cli.common import robot_of
-from adapter.report.difference_words import (
-    EFFECT_HEADS,
-    LEGEND,
-    MATRIX_HEADS,
-    difference_json,
-    difference_matrix,
-    difference_summary,
-    effect_rows,
-)
+from adapter.report import difference_words as words
 from adapter.runs.compare import compare, documentation_of
 from adapter.runs.terminal import console, output, write_json
 
@@ -31,13 +23,13 @@ def run(args: argparse.Namespace) -> int:
     found = compare(first, second)
     if args.second is not None and len(set(found.names)) == 1:  # two runs of one arm
         found = replace(found, names=(args.first, args.second))
-    write_json(args.json, difference_json(found))
+    write_json(args.json, words.difference_json(found))
     shown = console if str(args.json) == "-" else output
-    for line in difference_summary(found):
+    for line in words.difference_summary(found):
         shown.print(line, soft_wrap=True)
     for heads, rows in (
-        (MATRIX_HEADS, difference_matrix(found)),
-        (EFFECT_HEADS, effect_rows(found)),
+        (words.MATRIX_HEADS, words.difference_matrix(found)),
+        (words.EFFECT_HEADS, words.effect_rows(found)),
     ):
         if not rows:
             continue
@@ -46,5 +38,5 @@ def run(args: argparse.Namespace) -> int:
             table.add_row(*row)  # cells hold lines of their own
         shown.print(table)
     if found.changes:
-        shown.print(LEGEND, soft_wrap=True)
+        shown.print(words.LEGEND, soft_wrap=True)
     return 0

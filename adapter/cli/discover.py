@@ -11,16 +11,7 @@ from rich.table import Table
 from rich.text import Text
 from rich.tree import Tree as Shown
 
-from adapter.discovery import (
-    CUTOFF_HZ,
-    DECIDED,
-    Discovery,
-    Edge,
-    LearnedTree,
-    discover,
-    learn,
-    self_model,
-)
+from adapter import discovery
 from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.runs.compiling import announce_compiling
@@ -34,14 +25,14 @@ def run(args: argparse.Namespace) -> int:
     part = args.from_s, args.from_s + args.seconds
     log = read_log(args.log, topic=args.topic, beside="sensors", within_s=part)
     warn(log.warnings)
-    found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
+    found = discovery.discover(log, args.cutoff or discovery.CUTOFF_HZ, args.base)
     warn(list(found.notes))
     _print_tree(found)
     for sentence in found.undecided:
         labelled("undecided:", "yellow", sentence)
     figures = found.as_dict()
     try:
-        learned = learn(found)
+        learned = discovery.learn(found)
     except ModelError as error:
         if args.model is not None:
             raise
@@ -65,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_tree(found: Discovery) -> None:
+def _print_tree(found: discovery.Discovery) -> None:
     log = found.log
     show(
         f"{len(log.joint_names)} joints, {len(log.link_names)} links; "
@@ -83,21 +74,21 @@ def _print_tree(found: Discovery) -> None:
         output.print(top)
 
 
-def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
+def _hang(on: Shown, parent: str, edges: tuple[discovery.Edge, ...]) -> None:
     for edge in edges:
         if edge.parent == parent:
             sure = edge.confidence if edge.directed else edge.connected
-            style = "green" if sure >= DECIDED else "yellow"
+            style = "green" if sure >= discovery.DECIDED else "yellow"
             by = edge.joint if edge.joint is not None else "(no joint)"
             way = "" if edge.directed else " this way or the other"
             label = Text.assemble(f"{edge.link}  ", ("by", "dim"), f" {by}  ")
             # never rounded up to certainty
-            said = f"{min(sure, 0.9999):.4f}" if sure >= DECIDED else f"{sure:.2f}"
+            said = f"{min(sure, 0.9999):.4f}" if sure >= discovery.DECIDED else f"{sure:.2f}"
             label.append(said, style).append(way, "dim")
             _hang(on.add(label), edge.link, edges)
 
 
-def _print_lambda(learned: LearnedTree, known: np.ndarray) -> None:
+def _print_lambda(learned: discovery.LearnedTree, known: np.ndarray) -> None:
     """`known`: (n, 6) standard deviations, NaN where a single turn or shift is not shown."""
     tree, schema = learned.data.tree, learned.schema
     rows = []
@@ -113,7 +104,7 @@ def _print_lambda(learned: LearnedTree, known: np.ndarray) -> None:
         show(f"arbitrary, as no motion shows it: {sentence}")
 
 
-def _print_mountings(found: Discovery) -> None:
+def _print_mountings(found: discovery.Discovery) -> None:
     """Where sensors that do not turn about their z sit in their joints' frames."""
     rows = []
     for name, mounting in found.mountings.items():
@@ -133,9 +124,9 @@ def _print_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def _write_model(
-    args: argparse.Namespace, found: Discovery, learned: LearnedTree
+    args: argparse.Namespace, found: discovery.Discovery, learned: discovery.LearnedTree
 ) -> dict[str, Any]:
-    model, left = self_model(found, learned, args.log.stem)
+    model, left = discovery.self_model(found, learned, args.log.stem)
     save_model(model, args.model)
     lacking = "no torques" if found.log.tau is None else "no torques above 0"
     what = f"λ alone ({lacking if 'a' in found.bodies.motion else 'no accelerations'})"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.cli.agreement import PLAN_PAGE, whole_plan
+from adapter.cli.agreement import PLAN_PAGE
 from adapter.cli.common import robot_of, with_motion
 from adapter.cli.exit_codes import ExitCode
 from adapter.control.designed import DesignedMotion, Designer
@@ -27,7 +27,7 @@ from adapter.effects.splits import DecidingExperiment
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.report.plan_page import PlanWords, write_plan
+from adapter.report.plan_page import Plan
 from adapter.runs.config import read_config
 from adapter.runs.library import filtered
 from adapter.runs.terminal import results_folder, say, show
@@ -37,7 +37,6 @@ from drivers.files.mcap.writer import McapWriter, to_json
 TABLE, COMPARED = 300, 3  # instants of a path that are judged, random motions beside
 TENTH = 0.1  # of a period, between two durations that are looked at
 WORST = 8  # parameters that are shown
-SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -195,20 +194,14 @@ def _told(
 def _figures(
     told: Information, motion: DesignedMotion, seconds: float, expected: Expected
 ) -> dict[str, Any]:
+    numbers = (expected.std.tolist(), expected.wanted.tolist(), expected.shown.tolist())
     return {
         "seconds": seconds,
         "period_s": motion.period_s,
         "condition": told.condition(*motion.table(TABLE)),
         "parameters": [
             dict(zip(("name", "unit", "std", "wanted", "shown"), row, strict=True))
-            for row in zip(
-                expected.names,
-                expected.units,
-                expected.std.tolist(),
-                expected.wanted.tolist(),
-                expected.shown.tolist(),
-                strict=True,
-            )
+            for row in zip(expected.names, expected.units, *numbers, strict=True)
         ],
     }
 
@@ -261,10 +254,10 @@ def _write(
 ) -> None:
     """The page and both files of a motion from its start to rest."""
     names = arm.model.tree.joint_names
-    least = arm.clearance(motion, seconds)
-    lines = whole_plan(arm, motion, limits, seconds, least)
-    write_plan(folder / PLAN_PAGE, arm, motion, limits, least, PlanWords(lines))
-    step_ns = round(SECOND_NS / args.rate)
+    plan = Plan(arm, motion, limits, arm.clearance(motion, seconds))
+    lines = plan.lines(seconds)
+    page = plan.write(folder / PLAN_PAGE, lines)
+    step_ns = round(1e9 / args.rate)
     rows = [np.array([motion.q, motion.dq, motion.ddq])]
     while not motion.at_rest:
         if motion.time_s >= seconds:
@@ -284,4 +277,4 @@ def _write(
     for line in lines:
         show(line)
     show(f"{len(points)} points at {args.rate:g} Hz: {folder / 'motion.csv'}, motion.mcap")
-    say(f"As a page: {folder / PLAN_PAGE}")
+    say(f"As a page: {page}")

@@ -5,16 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import (
-    add_joints,
-    add_json,
-    add_told,
-    add_topic,
-    check_files,
-    check_robot,
-    check_told,
-    names_in,
-)
+from adapter.cli import options
 from adapter.errors import UsageError
 
 
@@ -29,12 +20,18 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     add("sources", nargs="+", metavar="[SIGNAL=]FILE")
     add("--to", type=Path, required=True, metavar="FILE", help="recording to write")
     _add_tables(parser)
-    add_topic(parser)
+    options.add_topic(parser)
     add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
-    add("--joints", type=names_in, default=(), metavar="LIST", help="joint names, commas between")
+    add(
+        "--joints",
+        type=options.names_in,
+        default=(),
+        metavar="LIST",
+        help="joint names, commas between",
+    )
     add("--flat", action="store_true", help="one value per line")
     add("--overwrite", action="store_true", help="replace an existing recording")
-    add_json(parser)
+    options.add_json(parser)
     parser.set_defaults(check=_check_import)
 
 
@@ -50,16 +47,16 @@ def _add_tables(parser: argparse.ArgumentParser) -> None:
 def _check_import(args: argparse.Namespace) -> None:
     for source in args.sources:
         if not Path(source).exists():
-            check_files(Path(source.partition("=")[2] or source))
-    check_robot(args.robot)
+            options.check_files(Path(source.partition("=")[2] or source))
+    options.check_robot(args.robot)
 
 
 def declare_recover(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.add_argument("file", type=Path, metavar="FILE")
     parser.add_argument("--to", type=Path, metavar="FILE", help="default: NAME.recovered.mcap")
-    add_json(parser)
-    parser.set_defaults(check=lambda args: check_files(args.file))
+    options.add_json(parser)
+    parser.set_defaults(check=lambda args: options.check_files(args.file))
 
 
 def declare_info(parser: argparse.ArgumentParser) -> None:
@@ -69,20 +66,20 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
         "of that arm: which combinations of parameters, how sure, and what is missing."
     )
     parser.add_argument("file", type=Path, metavar="FILE")
-    add_topic(parser)
+    options.add_topic(parser)
     _add_tables(parser)
     parser.add_argument("--robot", metavar="NAME|FILE", help="predict what the recording teaches")
-    add_joints(parser)
-    add_told(parser)
-    add_json(parser)
+    options.add_joints(parser)
+    options.add_told(parser)
+    options.add_json(parser)
     parser.set_defaults(check=_check_info)
 
 
 def _check_info(args: argparse.Namespace) -> None:
-    check_told(args)
-    check_robot(args.robot)
+    options.check_told(args)
+    options.check_robot(args.robot)
     if not args.file.is_dir():
-        check_files(args.file)
+        options.check_files(args.file)
 
 
 def declare_export(parser: argparse.ArgumentParser) -> None:
@@ -105,7 +102,7 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
         "neither --urdf nor --mjcf is given",
     )
     onto.add_argument("--alone", action="store_true", help="the arm alone, without pictures")
-    add_json(parser)
+    options.add_json(parser)
     parser.set_defaults(check=_check_export)
 
 
@@ -126,14 +123,14 @@ def _check_export(args: argparse.Namespace) -> None:
     for option, path, other in (("--urdf", args.urdf, ".xml"), ("--mjcf", args.mjcf, ".urdf")):
         if path is not None and path.suffix == other:
             raise UsageError(f"{option} {path}: have: --urdf FILE.urdf, --mjcf FILE.xml")
-    check_files(args.model, args.onto)
+    options.check_files(args.model, args.onto)
 
 
 def declare_report(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="results of run or replay")
     parser.add_argument("--html", type=Path, metavar="FILE", help="default: FOLDER/report.html")
-    add_json(parser)
+    options.add_json(parser)
     parser.set_defaults(check=_check_report)
 
 

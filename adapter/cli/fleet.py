@@ -18,17 +18,8 @@ from adapter.cli.results import write_urdf
 from adapter.model.model_file import save_model, whole_file
 from adapter.report.fleet_page import write_fleet_page
 from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary, to_be_shown
+from adapter.runs.fleet import fleet
 from adapter.runs.fleet.arm import FleetArm
-from adapter.runs.fleet.fleet import (
-    Fleet,
-    Manifest,
-    Settings,
-    forget,
-    found_logs,
-    learn_fleet,
-    read_manifest,
-    recall,
-)
 from adapter.runs.terminal import console, output, results_folder, say, show, warn, write_json
 
 MOST_ROWS = 40  # on the terminal; of more recordings those that there is something to say of
@@ -37,19 +28,21 @@ MOST_ROWS = 40  # on the terminal; of more recordings those that there is someth
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     robot = robot_of(args, args.model)
-    given = found_logs(args.logs)
+    given = fleet.found_logs(args.logs)
     folder = results_folder(args.out, "fleet")
-    manifest = Manifest({}, {}) if args.manifest is None else read_manifest(args.manifest)
-    settings = Settings(
+    manifest = (
+        fleet.Manifest({}, {}) if args.manifest is None else fleet.read_manifest(args.manifest)
+    )
+    settings = fleet.Settings(
         folder, args.workers, args.cluster, args.by, manifest, args.topic, told_of(args)
     )
-    forget(args.forget, robot, settings)
-    recall(args.remember, robot, settings)
+    fleet.forget(args.forget, robot, settings)
+    fleet.recall(args.remember, robot, settings)
     say(f"{len(given)} recordings; moments are kept in {folder}")
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("reading", total=len(given))
         settings = settings._replace(progress=lambda n, m: bar.update(task, completed=n, total=m))
-        found = learn_fleet(given, robot, settings)
+        found = fleet.learn_fleet(given, robot, settings)
     warn([f"{x.path}: left out: {x.why}" for x in found.broken])
     told = {*manifest.arms, *manifest.told}
     if told and not told & {*given, *(x.moments.path for a in found.arms for x in a.logs)}:
@@ -75,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     return ExitCode.DONE if found.arms else ExitCode.NOTHING_LEARNED
 
 
-def _write_table(found: Fleet, folder: Path) -> Path:
+def _write_table(found: fleet.Fleet, folder: Path) -> Path:
     """A row for each recording, whole or not at all: Parquet, or CSV where there is no pyarrow.
 
     Columns of joints are numbered from 1.

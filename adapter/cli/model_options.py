@@ -9,20 +9,24 @@ import argparse
 import os
 from pathlib import Path
 
-from adapter.cli.options import (
-    add_joints,
-    add_json,
-    add_results,
-    add_told,
-    add_topic,
-    check_files,
-    check_logs,
-    check_robot,
-    check_told,
-)
+from adapter.cli import options
 from adapter.errors import UsageError
 
 READ_S = 120.0  # of `discover`: as long as a recording that other commands hold in memory
+
+
+GAP_WORDS = {
+    "--model": "self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
+    "--servo": "recordings of a position-controlled arm (commanded and measured positions, no "
+    "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
+    "documented them, commands should be where the arm is)",
+    "--inertia-prior": "standard deviation of the model's inertial numbers, of their size "
+    "(default 0.05, centres to 0.1 m times that; of a position-controlled arm 0.02)",
+    "--hold-out": "score on these, fit all others (default: blocks of time are held out in turn)",
+    "--rounds": "rounds of the search, in each of which something may be named (default 24)",
+    "--simulator": "of the forward simulation (default pybullet where it is installed, extra "
+    "[sim]; mujoco is the extra [mujoco])",
+}
 
 
 def declare_gap(parser: argparse.ArgumentParser) -> None:
@@ -35,66 +39,30 @@ def declare_gap(parser: argparse.ArgumentParser) -> None:
         "tell anything is an answer too; one that does not fit the model (another robot, flipped "
         "signs, other units) cannot be used."
     )
-    add = parser.add_argument
+    add = options.declaring(parser, GAP_WORDS)
     add("logs", nargs="+", type=Path, metavar="LOG", help="recording, or a folder of such")
-    add_topic(parser)
-    add(
-        "--model",
-        required=True,
-        metavar="MODEL",
-        help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
-    )
-    add_joints(parser)
-    add(
-        "--servo",
-        type=Path,
-        metavar="FILE",
-        help="recordings of a position-controlled arm (commanded and measured positions, no "
-        "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
-        "documented them, commands should be where the arm is)",
-    )
-    add_told(parser)
-    add(
-        "--inertia-prior",
-        type=float,
-        metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.05, "
-        "centres to 0.1 m times that; of a position-controlled arm 0.02)",
-    )
-    add(
-        "--hold-out",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=Path,
-        metavar="LOG",
-        help="score on these, fit all others (default: blocks of time are held out in turn)",
-    )
+    options.add_topic(parser)
+    add("--model", required=True, metavar="MODEL")
+    options.add_joints(parser)
+    add("--servo", type=Path, metavar="FILE")
+    options.add_told(parser)
+    add("--inertia-prior", type=float, metavar="SHARE")
+    add("--hold-out", nargs="+", action="extend", default=[], type=Path, metavar="LOG")
     add("--validate-from", type=float, metavar="S", help="fit before this second, score after it")
-    add(
-        "--rounds",
-        type=int,
-        metavar="N",
-        help="rounds of the search, in each of which something may be named (default 24)",
-    )
+    add("--rounds", type=int, metavar="N")
     add_effects(parser)
-    add(
-        "--simulator",
-        choices=("pybullet", "mujoco"),
-        help="of the forward simulation (default pybullet where it is installed, extra [sim]; "
-        "mujoco is the extra [mujoco])",
-    )
+    add("--simulator", choices=("pybullet", "mujoco"))
     add("--no-simulation", action="store_true", help="compare torques only")
-    add_results(parser)
+    options.add_results(parser)
     parser.set_defaults(check=_check_gap)
 
 
 def _check_gap(args: argparse.Namespace) -> None:
-    args.logs, args.hold_out = check_logs(*args.logs), check_logs(*args.hold_out)
+    args.logs, args.hold_out = options.check_logs(*args.logs), options.check_logs(*args.hold_out)
     if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
-    check_told(args)
-    check_robot(args.model)
+    options.check_told(args)
+    options.check_robot(args.model)
 
 
 def declare_effects(parser: argparse.ArgumentParser) -> None:
@@ -123,6 +91,19 @@ def add_effects(parser: argparse.ArgumentParser, default: Path | None = None) ->
     )
 
 
+FLEET_WORDS = {
+    "logs": "recording, folder (with those inside it), pattern ('logs/**/*.mcap'), or address "
+    "that fsspec opens (s3://...); none: those of before alone",
+    "--model": "self model, .urdf, MJCF, or a robot's name",
+    "--by": "what tells arms apart: the name or serial number in the log (default; the model's "
+    "name where there is none), or the folder that it lies in",
+    "--manifest": "a table with a column log, and arm, or numbers that friction may follow "
+    "(temperature, age); goes before --by",
+    "--workers": "processes on this machine (default: as many as it has processors; 0: none "
+    "beside this one)",
+}
+
+
 def declare_fleet(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
@@ -131,55 +112,28 @@ def declare_fleet(parser: argparse.ArgumentParser) -> None:
         "of a recording are kept in --out: recordings join those of before, and none is read "
         "twice. λ is the model's."
     )
-    add = parser.add_argument
-    add(
-        "logs",
-        nargs="*",
-        metavar="LOG",
-        help="recording, folder (with those inside it), pattern ('logs/**/*.mcap'), or address "
-        "that fsspec opens (s3://...); none: those of before alone",
-    )
-    add_topic(parser)
-    add(
-        "--model", required=True, metavar="MODEL", help="self model, .urdf, MJCF, or a robot's name"
-    )
-    add_joints(parser)
-    add_told(parser)
-    add(
-        "--by",
-        choices=("log", "folder"),
-        default="log",
-        help="what tells arms apart: the name or serial number in the log (default; the model's "
-        "name where there is none), or the folder that it lies in",
-    )
-    add(
-        "--manifest",
-        type=Path,
-        metavar="CSV",
-        help="a table with a column log, and arm, or numbers that friction may follow "
-        "(temperature, age); goes before --by",
-    )
+    add = options.declaring(parser, FLEET_WORDS)
+    add("logs", nargs="*", metavar="LOG")
+    options.add_topic(parser)
+    add("--model", required=True, metavar="MODEL")
+    options.add_joints(parser)
+    options.add_told(parser)
+    add("--by", choices=("log", "folder"), default="log")
+    add("--manifest", type=Path, metavar="CSV")
     for name, said in (
         ("--forget", "leave these out from now on, though they are gone or given"),
         ("--remember", "do not leave these out any more"),
     ):
         add(name, nargs="+", action="extend", default=[], metavar="LOG", help=said)
-    add(
-        "--workers",
-        type=int,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes on this machine (default: as many as it has processors; 0: none beside "
-        "this one)",
-    )
+    add("--workers", type=int, default=os.cpu_count() or 1, metavar="N")
     add("--cluster", metavar="ADDRESS", help="of a Dask scheduler to send the tasks to")
-    add_results(parser)
+    options.add_results(parser)
     parser.set_defaults(check=_check_fleet)
 
 
 def _check_fleet(args: argparse.Namespace) -> None:
-    check_robot(args.model)
-    check_told(args)
+    options.check_robot(args.model)
+    options.check_told(args)
     if args.learn_gains:
         raise UsageError("--tau-gain fit: learn gains with `gap` or `replay`, and give them here")
     if not args.logs and args.out is None:
@@ -189,7 +143,13 @@ def _check_fleet(args: argparse.Namespace) -> None:
             raise UsageError(f"--{option} needs --out, the folder of the fleet that knows the LOG")
     if args.workers < 0:
         raise UsageError(f"--workers takes 0 or more, got {args.workers}")
-    check_files(args.manifest)
+    options.check_files(args.manifest)
+
+
+LOAD_WORDS = {
+    "--inertia-prior": "standard deviation of the model's inertial numbers, of their size "
+    "(default 0.05; 0.2 with --empty)"
+}
 
 
 def declare_load(parser: argparse.ArgumentParser) -> None:
@@ -199,33 +159,27 @@ def declare_load(parser: argparse.ArgumentParser) -> None:
         "inertia with standard deviations, and the lines that Franka and Universal Robots take. "
         "Without --empty the documented arm is the reference."
     )
-    add = parser.add_argument
+    add = options.declaring(parser, LOAD_WORDS)
     add("log", type=Path, metavar="LOG", help="recording with the load, moving or at rest")
-    add_topic(parser)
+    options.add_topic(parser)
     add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
     add("--robot", metavar="NAME|FILE", help="documented robot; the log's own, else panda")
-    add_joints(parser)
-    add_told(parser)
+    options.add_joints(parser)
+    options.add_told(parser)
     add("--frame", metavar="NAME", help="in whose axes (default: the flange of the last link)")
-    add(
-        "--inertia-prior",
-        type=float,
-        metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.05; "
-        "0.2 with --empty)",
-    )
-    add_json(parser, or_output=True)
+    add("--inertia-prior", type=float, metavar="SHARE")
+    options.add_json(parser, or_output=True)
     parser.set_defaults(check=_check_load)
 
 
 def _check_load(args: argparse.Namespace) -> None:
-    check_told(args)
+    options.check_told(args)
     if args.learn_gains and args.empty is None:
         raise UsageError("--tau-gain fit needs --empty LOG: gains and load cannot be told apart")
     if args.inertia_prior is not None and not 0.0 < args.inertia_prior <= 1.0:
         raise UsageError(f"--inertia-prior must be in (0, 1], got {args.inertia_prior}")
-    check_robot(args.robot)
-    check_logs(args.log, args.empty)
+    options.check_robot(args.robot)
+    options.check_logs(args.log, args.empty)
 
 
 def declare_diff(parser: argparse.ArgumentParser) -> None:
@@ -238,14 +192,23 @@ def declare_diff(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("first", metavar="A", help="model file (.json), robot file or known name")
     add("second", nargs="?", metavar="B", help="the same; without it A and its documentation")
-    add_joints(parser)
-    add_json(parser, or_output=True)
+    options.add_joints(parser)
+    options.add_json(parser, or_output=True)
     parser.set_defaults(check=_check_diff)
 
 
 def _check_diff(args: argparse.Namespace) -> None:
-    check_robot(args.first)
-    check_robot(args.second)
+    options.check_robot(args.first)
+    options.check_robot(args.second)
+
+
+DISCOVER_WORDS = {
+    "log": "MCAP recording with link motion: Imu topics, or /link_twists/<link> and "
+    "/link_accels/<link>",
+    "--seconds": f"read so many seconds, default {READ_S:g}; all of them are held in memory",
+    "--base": "the link that carries all others; needed for a floating base whose links' frames "
+    "do not turn about their z",
+}
 
 
 def declare_discover(parser: argparse.ArgumentParser) -> None:
@@ -255,32 +218,15 @@ def declare_discover(parser: argparse.ArgumentParser) -> None:
         "and who is whose parent, each with a confidence; say what the data leave open; then "
         "learn λ, and θ where torques were recorded."
     )
-    add = parser.add_argument
-    add(
-        "log",
-        type=Path,
-        metavar="LOG",
-        help="MCAP recording with link motion: Imu topics, "
-        "or /link_twists/<link> and /link_accels/<link>",
-    )
-    add_topic(parser)
+    add = options.declaring(parser, DISCOVER_WORDS)
+    add("log", type=Path, metavar="LOG")
+    options.add_topic(parser)
     add("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin at this second")
-    add(
-        "--seconds",
-        type=float,
-        default=READ_S,
-        metavar="S",
-        help=f"read so many seconds, default {READ_S:g}; all of them are held in memory",
-    )
+    add("--seconds", type=float, default=READ_S, metavar="S")
     add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
-    add(
-        "--base",
-        metavar="LINK",
-        help="the link that carries all others; needed for a floating base whose links' frames "
-        "do not turn about their z",
-    )
+    add("--base", metavar="LINK")
     add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
-    add_json(parser)
+    options.add_json(parser)
     parser.set_defaults(check=_check_discover)
 
 
@@ -289,4 +235,4 @@ def _check_discover(args: argparse.Namespace) -> list[Path]:
         raise UsageError(f"--from takes 0 or more seconds, got {args.from_s}")
     if not args.seconds > 0.0:
         raise UsageError(f"--seconds must be above zero, got {args.seconds}")
-    return check_logs(args.log)
+    return options.check_logs(args.log)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from adapter.errors import UsageError
 from adapter.model.robot_names import ROBOT_FILES, robot_names
@@ -21,6 +22,17 @@ from drivers.files.names import RECORDINGS, is_recording
 MODES = ("moments", "sample")  # of `adapter.learning.learner`
 NAMES = "adapter.cli.names"  # brings NumPy; loaded by name where there is a name to look up
 MODEL_FILES = (".urdf", ".xml", ".json")
+
+
+def declaring(
+    parser: argparse.ArgumentParser, words: Mapping[str, str]
+) -> Callable[..., argparse.Action]:
+    """What declares an option, as `add_argument`; its help is among these words, or given."""
+
+    def add(option: str, **how: Any) -> argparse.Action:
+        return parser.add_argument(option, **{"help": words.get(option), **how})
+
+    return add
 
 
 def add_learning(parser: argparse.ArgumentParser) -> None:
@@ -137,9 +149,27 @@ def add_topic(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--topic", metavar="NAME", help=said)
 
 
+TOLD_WORDS = {
+    "--turn": "joints that LOG counts the other way: q, dq and tau get the other sign",
+    "--zero": "what LOG tells where the model's joint is at zero, once turned by a --turn before",
+    "--tau": "the controller took the arm's gravity off the efforts: the model's is added "
+    "(--gravity 0 0 0: also that of the load)",
+    "--trust-log": "joints and efforts are as the model has them: what speaks against it is a "
+    "warning",
+    "--tau-gain": "N m per recorded unit (motor current: N m/A), one per joint of the model or "
+    "one for all, negative where the sign is wrong; those of several multiply; fit: learn them "
+    "beside θ against the documented masses",
+    "--gear": "efforts are of the motors: turns of the motor per turn of the link, one per joint "
+    "or one for all; velocities and positions are of the links",
+    "--known-load": "mass of a body that the hand carries in the recordings of --loaded "
+    "(default: in all LOGs), so that --tau-gain fit knows the gains' scale",
+    "--loaded": "with the known load, among the LOGs or beside them for the gains alone",
+}
+
+
 def add_told(parser: argparse.ArgumentParser) -> None:
     """How recordings tell joints and efforts, where it is not as the model has them."""
-    add = parser.add_argument
+    add = declaring(parser, TOLD_WORDS)
     add(
         "--turn",
         dest="turn_or_zero",
@@ -147,57 +177,14 @@ def add_told(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=_turned,
         metavar="JOINT,...",
-        help="joints that LOG counts the other way: q, dq and tau get the other sign",
     )
-    add(
-        "--zero",
-        dest="turn_or_zero",
-        action="extend",
-        type=_zeros,
-        metavar="JOINT=RAD,...",
-        help="what LOG tells where the model's joint is at zero, once turned by a --turn before",
-    )
-    add(
-        "--tau",
-        choices=("gravity-compensated",),
-        help="the controller took the arm's gravity off the efforts: the model's is added "
-        "(--gravity 0 0 0: also that of the load)",
-    )
-    add(
-        "--trust-log",
-        action="store_true",
-        help="joints and efforts are as the model has them: what speaks against it is a warning",
-    )
-    add(
-        "--tau-gain",
-        action="append",
-        metavar="G1,G2,...|fit",
-        help="N m per recorded unit (motor current: N m/A), one per joint of the model or one for "
-        "all, negative where the sign is wrong; those of several multiply; fit: learn them beside "
-        "θ against the documented masses",
-    )
-    add(
-        "--gear",
-        metavar="G1,G2,...",
-        help="efforts are of the motors: turns of the motor per turn of the link, one per joint or "
-        "one for all; velocities and positions are of the links",
-    )
-    add(
-        "--known-load",
-        type=float,
-        metavar="KG",
-        help="mass of a body that the hand carries in the recordings of --loaded (default: in all "
-        "LOGs), so that --tau-gain fit knows the gains' scale",
-    )
-    add(
-        "--loaded",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=Path,
-        metavar="LOG",
-        help="with the known load, among the LOGs or beside them for the gains alone",
-    )
+    add("--zero", dest="turn_or_zero", action="extend", type=_zeros, metavar="JOINT=RAD,...")
+    add("--tau", choices=("gravity-compensated",))
+    add("--trust-log", action="store_true")
+    add("--tau-gain", action="append", metavar="G1,G2,...|fit")
+    add("--gear", metavar="G1,G2,...")
+    add("--known-load", type=float, metavar="KG")
+    add("--loaded", nargs="+", action="extend", default=[], type=Path, metavar="LOG")
 
 
 def _turned(text: str) -> list[tuple[str, float, float]]:

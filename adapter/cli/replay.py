@@ -14,21 +14,11 @@ from adapter.cli.results import Learned, code_of, conclude
 from adapter.errors import SettingsError
 from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.self_model import SelfModel
+from adapter.runs import replay
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines
 from adapter.runs.outcome import learned_model
-from adapter.runs.replay import (
-    Replay,
-    ReplayOptions,
-    fitted_to,
-    from_s,
-    held_out_rms,
-    last_s,
-    noise_levels,
-    one_after_other,
-)
-from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import DISAGREEMENT, console, labelled, results_folder, say, show, warn
 from adapter.screening.screen import check_torque
@@ -53,13 +43,13 @@ def run(args: argparse.Namespace) -> int:
     logs = [_joined(args, whole, robot)]
     logs += [matching(read_log(path, topic=args.topic), robot) for path in more]
     logs, gains = _as_told(args, logs, robot)
-    log = one_after_other(logs) if more else logs[0]
+    log = replay.one_after_other(logs) if more else logs[0]
     imus: tuple[str, ...] = ()
     if args.base is None:
         log, imus = with_link_imus(log, robot, args.imu)
     log.warnings.extend(locked)
     warn(log.warnings)
-    fitted, notes = fitted_to(log, config.pipeline.filter)
+    fitted, notes = replay.fitted_to(log, config.pipeline.filter)
     warn(notes)
     learner = replace(config.pipeline.learner, base_wrench=args.base_wrench == "zero")
     pipeline = replace(config.pipeline, filter=fitted, learner=learner)
@@ -71,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if front_end.first_moving_ns is None:
         warn([f"{source}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
     numbers["torque_gains"] = None if gains is None else gains.as_dict()
-    held_out = None if args.validate_from is None else from_s(log, args.validate_from)
+    held_out = None if args.validate_from is None else replay.from_s(log, args.validate_from)
     if args.validate is not None:
         other = read_log(
             args.validate, topic=args.topic, beside="" if args.base is None else "frames"
@@ -81,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if held_out is not None:
         model = learned_model(result.outcome, robot)
         for key, judged in (("", model), ("documented_", robot)):
-            error = held_out_rms(held_out, judged, config.pipeline)
+            error = replay.held_out_rms(held_out, judged, config.pipeline)
             numbers["theta"][f"{key}validation_torque_rmse_nm"] = error.value.tolist()
             numbers["theta"][f"{key}validation_torque_rmse_std_nm"] = error.std.tolist()
     folder = results_folder(args.out, "replay")
@@ -92,7 +82,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _figures(
-    args: argparse.Namespace, log: Log, robot: SelfModel, reference: Reference, result: Replay
+    args: argparse.Namespace,
+    log: Log,
+    robot: SelfModel,
+    reference: Reference,
+    result: replay.Replay,
 ) -> dict[str, Any]:
     front_end = result.pipeline.front_end
     course = Course(
@@ -122,7 +116,7 @@ def _figures(
         robot=robot.name,
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),
-        noise=noise_levels(log),
+        noise=replay.noise_levels(log),
         gaps=[
             {"after_s": 1e-9 * stamp - front_end.start_s, "length_s": length}
             for stamp, length in front_end.gaps
@@ -145,7 +139,7 @@ def _as_told(
     taught: list[Log] = []
     if told.learn:
         say("learning the gains of the drives")
-        taught = logs if until is None else [from_s(x, 0.0, until) for x in logs]
+        taught = logs if until is None else [replay.from_s(x, 0.0, until) for x in logs]
     logs, gains = as_told(logs, robot, told, taught)
     if gains is not None:
         logs[0].warnings.extend([*gains.notes, *gains.words()])
@@ -162,19 +156,19 @@ def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:
     return log if args.base is None else with_base_motion(log, robot, args.base)
 
 
-def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> Replay:
-    if args.validate_from is not None and not 0.0 < args.validate_from < last_s(log):
+def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> replay.Replay:
+    if args.validate_from is not None and not 0.0 < args.validate_from < replay.last_s(log):
         raise SettingsError(
             f"--validate-from {args.validate_from} is outside the recording "
-            f"(0 to {last_s(log):.1f} s)"
+            f"(0 to {replay.last_s(log):.1f} s)"
         )
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("learning", total=len(log))
-        options = ReplayOptions(
+        options = replay.ReplayOptions(
             every=args.every,
             until_s=args.validate_from,
             progress=lambda done: bar.update(task, completed=done),
             resume=args.resume,
             say=None if args.quiet else partial(labelled, f"{DISAGREEMENT}:", "yellow"),
         )
-        return learn_from(log, robot, config.pipeline, options)
+        return replay.replay(log, robot, config.pipeline, options)

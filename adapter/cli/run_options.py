@@ -6,21 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from adapter.cli.options import (
-    NAMES,
-    add_json,
-    add_learning,
-    add_motion,
-    add_robot,
-    add_told,
-    add_topic,
-    check_files,
-    check_learning,
-    check_logs,
-    check_robot,
-    check_told,
-    numbers,
-)
+from adapter.cli import options
 from adapter.control.settings import DESIGNED, KINDS
 from adapter.errors import UsageError
 from adapter.model.robot_names import robot_names
@@ -34,95 +20,57 @@ DEFAULT_PORT, MOST_PORT = 8765, 65535  # of Foxglove; of all
 SHARE, LONGEST_S, RATE_HZ = 0.2, 300.0, 200.0  # of `excite`
 
 
+RUN_WORDS = {
+    "--driver": "pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=..., "
+    "ros2:///joint_states, FILE.py:CLASS of your own",
+    "--allow-motion": "leave to move an arm that may be real (fci, can, ros2): prints the plan, "
+    "goes at a tenth of the speed for 10 s, stops when this terminal closes. Without it, only "
+    "listen",
+    "--trust-model": "move an arm that may be real although what it holds at rest is not the "
+    "weight that the model says",
+    "--excitation": "motion: random (default), or designed to teach most in the time",
+    "--duration": "default 30; where the arm moves slowly at first (excitation.slow_s), behind "
+    "that",
+    "--scenario": "of the simulated arm: nominal, bent_link, payload_at_20s, friction, "
+    "real_drives, wall_mounted (whose mounting is to be told: --gravity 9.81 0 0)",
+    "--set": "option of the scenario, as in --set mass=0.3 --set noise=none",
+    "--feedforward": "model that helps the controller (default none; for a designed motion "
+    "documented); its worth is told as tracking error",
+    "--view": "serve a page to watch the run on, on this machine alone (default port 8400, or "
+    "another where that is taken; 0: any)",
+    "--foxglove": "serve Foxglove's WebSocket protocol, which PlotJuggler takes too, on this "
+    "machine alone (default port 8765; needs panda-adapter[live])",
+    "--trust-log": "torques are as the model has them: what speaks against it is a warning",
+}
+
+
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Move an arm on smooth trajectories (or only listen) and learn λ and θ at its "
         "rate, in real time."
     )
-    add = parser.add_argument
-    add(
-        "--driver",
-        default="pybullet:panda",
-        metavar="ADDRESS",
-        help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=..., "
-        "ros2:///joint_states, FILE.py:CLASS of your own",
-    )
-    add(
-        "--allow-motion",
-        action="store_true",
-        help="leave to move an arm that may be real (fci, can, ros2): prints the plan, goes at a "
-        "tenth of the speed for 10 s, stops when this terminal closes. Without it, only listen",
-    )
+    add = options.declaring(parser, RUN_WORDS)
+    add("--driver", default="pybullet:panda", metavar="ADDRESS")
+    add("--allow-motion", action="store_true")
     add("--yes", action="store_true", help="move without being asked after the plan")
-    add(
-        "--trust-model",
-        action="store_true",
-        help="move an arm that may be real although what it holds at rest is not the weight that "
-        "the model says",
-    )
-    add(
-        "--excitation",
-        choices=KINDS,
-        help="motion: random (default), or designed to teach most in the time",
-    )
-    add_motion(parser)
-    add(
-        "--duration",
-        type=float,
-        default=30.0,
-        metavar="S",
-        help="default 30; where the arm moves slowly at first (excitation.slow_s), behind that",
-    )
-    add(
-        "--scenario",
-        metavar="NAME",
-        help="of the simulated arm: nominal, bent_link, payload_at_20s, friction, real_drives, "
-        "wall_mounted (whose mounting is to be told: --gravity 9.81 0 0)",
-    )
-    add(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="option of the scenario, as in --set mass=0.3 --set noise=none",
-    )
+    add("--trust-model", action="store_true")
+    add("--excitation", choices=KINDS)
+    options.add_motion(parser)
+    add("--duration", type=float, default=30.0, metavar="S")
+    add("--scenario", metavar="NAME")
+    add("--set", action="append", default=[], metavar="KEY=VALUE")
     add("--passive", action="store_true", help="only listen; do not move the arm")
     add("--fault", metavar="LIST", help="inject faults into the samples, as in lost=0.01,nan=0.001")
-    add(
-        "--feedforward",
-        choices=FEEDFORWARD,
-        help="model that helps the controller (default none; for a designed motion documented); "
-        "its worth is told as tracking error",
-    )
-    add(
-        "--view",
-        nargs="?",
-        type=_port,
-        const=ANY,
-        metavar="PORT",
-        help="serve a page to watch the run on, on this machine alone (default port 8400, or "
-        "another where that is taken; 0: any)",
-    )
-    add(
-        "--foxglove",
-        nargs="?",
-        type=_port,
-        const=DEFAULT_PORT,
-        metavar="PORT",
-        help="serve Foxglove's WebSocket protocol, which PlotJuggler takes too, on this machine "
-        "alone (default port 8765; needs panda-adapter[live])",
-    )
+    add("--feedforward", choices=FEEDFORWARD)
+    add("--view", nargs="?", type=_port, const=ANY, metavar="PORT")
+    add("--foxglove", nargs="?", type=_port, const=DEFAULT_PORT, metavar="PORT")
     add("--record", type=Path, metavar="FILE", help="default: in the results")
     add("--overwrite", action="store_true", help="replace an existing recording")
     add("--no-record", action="store_true", help="keep no recording")
-    add(
-        "--trust-log",
-        action="store_true",
-        help="torques are as the model has them: what speaks against it is a warning",
-    )
+    add("--trust-log", action="store_true")
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
-    add_learning(parser)
+    options.add_learning(parser)
     parser.set_defaults(check=_check)
 
 
@@ -149,7 +97,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--duration must be above zero, got {args.duration}")
     scheme, rest = split_address(args.driver)
     if is_own(scheme):
-        check_files(Path(scheme))
+        options.check_files(Path(scheme))
     elif scheme not in SCHEMES:
         raise UsageError(f"no driver '{scheme}'; {choices(scheme, SCHEMES, OWN_KIND)}")
     if scheme == "pybullet" and rest not in SIMULATED:
@@ -168,9 +116,9 @@ def _check(args: argparse.Namespace) -> None:
             f"an arm behind {args.driver} does not say which robot it is; --robot must, before it "
             f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"
         )
-    check_learning(args)
+    options.check_learning(args)
     if args.fault is not None or args.scenario or args.set:
-        import_module(NAMES).check_run(args)
+        import_module(options.NAMES).check_run(args)
 
 
 def simulated(address: str) -> bool:
@@ -185,6 +133,15 @@ def simulated(address: str) -> bool:
     return "interface=virtual" in query.split("&")
 
 
+EXCITE_WORDS = {
+    "--at": "where it starts, rad (default: where the first LOG does)",
+    "--std": "wanted, of the parameters of a body of 1 kg, 10 cm across, and of an effect's "
+    f"usual size (default {SHARE:g}: 0.2 kg, 0.02 kg m, 0.002 kg m², 0.2 N m of friction)",
+    "--noise": "standard deviation of each joint's torque, N m (default: of the LOGs, else 0.3 "
+    "%% of the effort limits)",
+}
+
+
 def declare_excite(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
@@ -194,47 +151,45 @@ def declare_excite(parser: argparse.ArgumentParser) -> None:
         "to be measured next. Writes it as CSV, as MCAP (trajectory_msgs/JointTrajectory) and as a "
         "page; nothing moves. `adapter run --excitation designed` moves an arm so."
     )
-    add = parser.add_argument
+    add = options.declaring(parser, EXCITE_WORDS)
     add("logs", nargs="*", type=Path, metavar="LOG", help="recordings of the arm that are there")
-    add_robot(parser)
+    options.add_robot(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML: [cell], [excitation], ...")
-    add(
-        "--at", metavar="Q1,Q2,...", help="where it starts, rad (default: where the first LOG does)"
-    )
-    add(
-        "--std",
-        type=float,
-        default=SHARE,
-        metavar="SHARE",
-        help="wanted, of the parameters of a body of 1 kg, 10 cm across, and of an effect's usual "
-        f"size (default {SHARE:g}: 0.2 kg, 0.02 kg m, 0.002 kg m², 0.2 N m of friction)",
-    )
-    add(
-        "--noise",
-        metavar="S1,S2,...",
-        help="standard deviation of each joint's torque, N m (default: of the LOGs, else 0.3 %% of "
-        "the effort limits)",
-    )
+    add("--at", metavar="Q1,Q2,...")
+    add("--std", type=float, default=SHARE, metavar="SHARE")
+    add("--noise", metavar="S1,S2,...")
     add("--gap", type=Path, metavar="FILE", help="JSON of `adapter gap`: what to measure next")
-    add_motion(parser)
+    options.add_motion(parser)
     add("--seed", type=int, help="of the motion")
     add("--longest", type=float, default=LONGEST_S, metavar="S", help=f"default {LONGEST_S:g}")
     said = f"of points (default {RATE_HZ:g})"
     add("--rate", type=float, default=RATE_HZ, metavar="HZ", help=said)
-    add_json(parser)
+    options.add_json(parser)
     add("--out", type=Path, metavar="FOLDER", help="where results go")
     parser.set_defaults(check=_check_excite, excitation=DESIGNED)
 
 
 def _check_excite(args: argparse.Namespace) -> None:
-    check_robot(args.robot)
-    check_files(args.config, args.gap)
-    args.logs = check_logs(*args.logs)
-    args.at = numbers("--at", args.at, what="numbers")
-    args.noise = numbers("--noise", args.noise)
+    options.check_robot(args.robot)
+    options.check_files(args.config, args.gap)
+    args.logs = options.check_logs(*args.logs)
+    args.at = options.numbers("--at", args.at, what="numbers")
+    args.noise = options.numbers("--noise", args.noise)
     for name, least in (("std", 0.0), ("longest", 1.0), ("rate", 1.0)):
         if not getattr(args, name) > least:
             raise UsageError(f"--{name} must be above {least:g}, got {getattr(args, name)}")
+
+
+REPLAY_WORDS = {
+    "logs": "recording (MCAP, rosbag2, ROS 1), or a folder of such; several of one arm are "
+    "learned from in order",
+    "--base": "the base floats, and this is its link (or one fixed to it); its motion is in the "
+    "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
+    "--base-wrench": "what pushes a floating base: zero in free motion; unknown (default), as "
+    "where it stands or hangs: only the joints' torques are learned from",
+    "--imu": "an Imu glued on a link, anyhow; may be repeated. Needed where the messages' frame "
+    "does not name the link; none: take no notice of any",
+}
 
 
 def declare_replay(parser: argparse.ArgumentParser) -> None:
@@ -243,40 +198,15 @@ def declare_replay(parser: argparse.ArgumentParser) -> None:
         "Learn λ and θ from an MCAP recording, sample by sample as the live process does (the "
         "result is the same), or in batches."
     )
-    add = parser.add_argument
-    add(
-        "logs",
-        nargs="+",
-        type=Path,
-        metavar="LOG",
-        help="recording (MCAP, rosbag2, ROS 1), or a folder of such; several of one arm are "
-        "learned from in order",
-    )
-    add_topic(parser)
-    add_learning(parser)
-    add_told(parser)
+    add = options.declaring(parser, REPLAY_WORDS)
+    add("logs", nargs="+", type=Path, metavar="LOG")
+    options.add_topic(parser)
+    options.add_learning(parser)
+    options.add_told(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
-    add(
-        "--base",
-        metavar="LINK",
-        help="the base floats, and this is its link (or one fixed to it); its motion is in the "
-        "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
-    )
-    add(
-        "--base-wrench",
-        choices=("zero", "unknown"),
-        default="unknown",
-        help="what pushes a floating base: zero in free motion; unknown (default), as where it "
-        "stands or hangs: only the joints' torques are learned from",
-    )
-    add(
-        "--imu",
-        action="append",
-        default=[],
-        metavar="TOPIC=LINK",
-        help="an Imu glued on a link, anyhow; may be repeated. Needed where the messages' frame "
-        "does not name the link; none: take no notice of any",
-    )
+    add("--base", metavar="LINK")
+    add("--base-wrench", choices=("zero", "unknown"), default="unknown")
+    add("--imu", action="append", default=[], metavar="TOPIC=LINK")
     held_out = parser.add_mutually_exclusive_group()
     held_out.add_argument("--validate", type=Path, metavar="LOG", help="score on this recording")
     held_out.add_argument(
@@ -290,9 +220,9 @@ def _check_replay(args: argparse.Namespace) -> None:
         raise UsageError("--every needs mode moments; have: --mode moments, or --every 1")
     alone = {"--base": args.base, "--imu": args.imu, "--validate-from": args.validate_from}
     given = [option for option, value in alone.items() if value]
-    args.logs = check_logs(*args.logs)
+    args.logs = options.check_logs(*args.logs)
     if given and len(args.logs) > 1:
         raise UsageError(f"{', '.join(given)} go with one LOG, not with several")
-    check_told(args)
-    check_learning(args)
-    check_logs(args.validate)
+    options.check_told(args)
+    options.check_learning(args)
+    options.check_logs(args.validate)

@@ -135,11 +135,7 @@ def _moved(bodies: Bodies, link: int, body: int, joint: int, axis: Array) -> _Jo
     w, dw = bodies.motion["w"][:, link], bodies.motion["dw"][:, link]
     far = bodies.motion["dw"][:, body]
     columns = np.concatenate(
-        [
-            np.einsum("mba,mc->mabc", turn, far).reshape(m, 3, 9),
-            -dq[:, :, None] * skew(u),
-        ],
-        axis=2,
+        [np.einsum("mba,mc->mabc", turn, far).reshape(m, 3, 9), -dq[:, :, None] * skew(u)], axis=2
     ).reshape(3 * m, 12)
     right = (dw - ddq * u - dq * np.cross(w, u)).reshape(-1)
     found, *_ = np.linalg.lstsq(columns, right, rcond=1e-9)

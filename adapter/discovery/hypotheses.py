@@ -72,13 +72,11 @@ class Hypotheses:
         options: by link.
         mounted: whether frames may be any.
         excess: by channel, how many times larger than the noise says the misfit of all links is.
-        tolerance: ratio of misfit to expected variance that still counts as noise.
     """
 
     bodies: Bodies
     options: tuple[tuple[Option, ...], ...]
     excess: dict[str, float]
-    tolerance: float
     mounted: bool = False
 
 
@@ -100,7 +98,7 @@ def hypotheses_of(bodies: Bodies, misfit: dict[str, Array]) -> Hypotheses:
         ranked(convention_options(scores, j, fits[j], misfit), scores, j)
         for j in range(bodies.links)
     )
-    return Hypotheses(bodies, options, scores.excess, scores.tolerance)
+    return Hypotheses(bodies, options, scores.excess)
 
 
 def keeps_convention(bodies: Bodies, misfit: dict[str, Array]) -> bool:
@@ -201,7 +199,10 @@ def ranked(
 
 
 class Scores:
-    """Expected variances, and the log likelihood of a misfit."""
+    """Expected variances, and the log likelihood of a misfit.
+
+    `tolerance`: ratio of misfit to expected variance that still counts as noise.
+    """
 
     def __init__(self, bodies: Bodies) -> None:
         log = bodies.log
@@ -289,7 +290,7 @@ def mounted_hypotheses(bodies: Bodies, misfit: dict[str, Array]) -> Hypotheses:
     found = [convention_options(scores, j, kept[j], misfit) for j in range(bodies.links)]
     _add_mounted(found, scores, pairs, fits)
     options = tuple(ranked(_best(o), scores, j, MOUNT_PRIOR) for j, o in enumerate(found))
-    return Hypotheses(bodies, options, scores.excess, scores.tolerance, True)
+    return Hypotheses(bodies, options, scores.excess, True)
 
 
 def _pairs_of(scores: Scores) -> _Pairs:

@@ -65,17 +65,6 @@ def learn(discovery: Discovery) -> LearnedTree:
     return LearnedTree(data, replace(schema, std=schema.std * gain))
 
 
-def _in_joint_frames(discovery: Discovery) -> dict[str, Array]:
-    """Motion by channel, links whose axis was found in frames with z on it."""
-    motion = {k: x.copy() for k, x in discovery.bodies.motion.items()}
-    for option in discovery.structure.chosen:
-        if option.mounting is not None:
-            own = in_joint_frame(discovery.bodies.motion, option.link, option.mounting)
-            for k, x in own.items():
-                motion[k][:, option.link] = x
-    return motion
-
-
 def tree_data(discovery: Discovery) -> TreeData:
     """The recording's filtered samples, in the order of the discovered tree and its joint frames.
 
@@ -83,7 +72,13 @@ def tree_data(discovery: Discovery) -> TreeData:
         ModelError: the tree has more than one root, or joints that move no link of it.
     """
     order, root = _order(discovery)
-    log, motion = discovery.log, _in_joint_frames(discovery)
+    log = discovery.log
+    motion = {k: x.copy() for k, x in discovery.bodies.motion.items()}
+    for option in discovery.structure.chosen:
+        if option.mounting is not None:  # its axis was found
+            own = in_joint_frame(discovery.bodies.motion, option.link, option.mounting)
+            for k, x in own.items():
+                motion[k][:, option.link] = x
     number = {option.link: k for k, option in enumerate(order)}
     parent = tuple(number.get(option.parent, BASE) for option in order)
     links = [option.link for option in order]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,14 +61,8 @@ class Edge:
     parent: str | None
     confidence: float
     connected: float
-    rival: Edge | None = None
     directed: bool = True
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        keys = ("joint", "link", "parent", "confidence", "connected", "directed")
-        out = {key: getattr(self, key) for key in keys}
-        return {**out, "rival": None if self.rival is None else self.rival.as_dict()}
+    rival: Edge | None = None
 
 
 @dataclass(frozen=True)
@@ -123,8 +117,8 @@ class Discovery:
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         log = self.log
-        jointed = [edge.as_dict() for edge in self.edges if edge.joint is not None]
-        rigid = [edge.as_dict() for edge in self.edges if edge.joint is None and edge.parent]
+        jointed = [asdict(edge) for edge in self.edges if edge.joint is not None]
+        rigid = [asdict(edge) for edge in self.edges if edge.joint is None and edge.parent]
         return {
             "root": self.root,
             "root_confidence": self.root_confidence,
@@ -276,7 +270,7 @@ def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = Non
     names = body_names(bodies)
     joint = None if option.joint == NO_JOINT else bodies.log.joint_names[option.joint]
     parent = None if option.parent == FREE else names[option.parent]
-    return Edge(joint, names[option.link], parent, share, share, rival)
+    return Edge(joint, names[option.link], parent, share, share, rival=rival)
 
 
 # --- sentences on what is left open, why, and which motion would decide it ---------------------

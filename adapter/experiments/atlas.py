@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.baselines.compare import Errors, arm_tables, choices, compare
+from adapter.experiments.baselines import presets
+from adapter.experiments.baselines.compare import Errors, arm_tables, compare
+from adapter.experiments.baselines.features import Columns, sub_chain, sub_parents
 from adapter.experiments.falls import Falls, gathered, sets_of
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
 from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
@@ -35,7 +37,6 @@ from adapter.runs.outcome import frame_errors
 from adapter.runs.terminal import console
 from sim.falls.data_set import Flight, data_set
 
-SOLVER_NAMES = {"consistent": "interior point (Clarabel)"}
 ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
@@ -108,27 +109,23 @@ class Judged:
     training: KinematicErrors
 
 
-class _Judge:
-    """Gathers errors of one body, trajectory by trajectory."""
-
-    def __init__(self, body: Body, joints: int, arm: Sequence[int]) -> None:
-        self._body, self._n, self._arm = body, joints, list(arm)
-        self._whole, self._part = Errors(joints), Errors(len(self._arm))
-        self._kinematics: list[KinematicErrors] = []
-
-    def add(self, data: TreeData, rows: dict[str, np.ndarray]) -> None:
-        """A trajectory, and its rows by set."""
-        estimate = predicted_torques(data, self._body.lam, self._body.theta.theta)[:, -self._n :]
-        for name, own in rows.items():
-            tau = data.tau[own][:, -self._n :]
-            self._whole.add(name, tau, estimate[own])
-            self._part.add(name, tau[:, self._arm], estimate[own][:, self._arm])
-        if "control" in rows:
-            self._kinematics.append(kinematic_errors(data, self._body.lam))
-
-    def verdict(self, learned_from: TreeData) -> Judged:
-        """All of it."""
-        body = self._body
+def judge(
+    bodies: Sequence[Body], learned_from: TreeData, source: Falls, parts: Split
+) -> list[Judged]:
+    """Torques on every sample, of all joints and of the arm's; link motion on the control set."""
+    n, arm = learned_from.tree.n, list(ARM)
+    errors = [(body, Errors(n), Errors(len(arm)), list[KinematicErrors]()) for body in bodies]
+    for data, rows in sets_of(source, parts):
+        for body, whole, part, kinematics in errors:
+            estimate = predicted_torques(data, body.lam, body.theta.theta)[:, -n:]
+            for name, own in rows.items():
+                tau = data.tau[own][:, -n:]
+                whole.add(name, tau, estimate[own])
+                part.add(name, tau[:, arm], estimate[own][:, arm])
+            if "control" in rows:
+                kinematics.append(kinematic_errors(data, body.lam))
+    judged = []
+    for body, whole, part, kinematics in errors:
         how = "mini-batches" if body.name == "FOPnet" else "second moments"
         title = f"First-order-principles networks, λ from {how}"
         learned = LearnerScores(body.name, title, train_s=body.learning_s)
@@ -138,26 +135,10 @@ class _Judge:
             f"θ over bodies that can exist, {len(body.theta.stages)} sub-problems in "
             f"{body.theta_s:.1f} s",
         ]
-        arm = LearnerScores(f"{body.name}, arm", title, train_s=body.learning_s)
+        of_arm = part.into(LearnerScores(f"{body.name}, arm", title, train_s=body.learning_s))
         training = kinematic_errors(learned_from, body.lam)
-        return Judged(
-            body,
-            self._whole.into(learned),
-            self._part.into(arm),
-            _worst(self._kinematics),
-            training,
-        )
-
-
-def judge(
-    bodies: Sequence[Body], learned_from: TreeData, source: Falls, parts: Split, arm: Sequence[int]
-) -> list[Judged]:
-    """Torques on every sample, of all joints and of an arm's; link motion on the control set."""
-    judges = [_Judge(body, learned_from.tree.n, arm) for body in bodies]
-    for data, rows in sets_of(source, parts):
-        for one in judges:
-            one.add(data, rows)
-    return [one.verdict(learned_from) for one in judges]
+        judged.append(Judged(body, whole.into(learned), of_arm, _worst(kinematics), training))
+    return judged
 
 
 def _worst(parts: list[KinematicErrors]) -> KinematicErrors:
@@ -221,7 +202,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     say(f"learning λ and θ from {len(data)} samples")
     networks, *bodies = learn_bodies(data, args.seed)
     say("judging all samples")
-    by_networks, by_moments = judge(bodies, data, source, parts, ARM)
+    by_networks, by_moments = judge(bodies, data, source, parts)
     say("learning from noisy sensors")
     noisy_parts = split(count * [len(source.measured(0))], args.seed)
     noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
@@ -279,9 +260,10 @@ def _baselines(
     tree = source.tree
     joints = [tree.joint_names[j] for j in ARM]
     carrier = tree.link_names[tree.parent[ARM[0]]]
+    index = sub_chain(tree, joints, carrier)
+    arm = Columns(len(index)), sub_parents(tree, index), source.truth.lam[index]
     sets = arm_tables(source, parts, joints, carrier)
-    chosen = choices(tree, source.truth.lam, joints, carrier, args.full, args.seed)
-    return compare(sets, chosen, args.seed, say)
+    return compare(sets, presets.learners(*arm, args.full, args.seed), args.seed, say)
 
 
 # --- every number of the experiment under a key of its own --------------------------------------
@@ -296,7 +278,7 @@ def _learning(
     return {
         "minibatch": settings.minibatch,
         "cycles": settings.cycles,
-        "theta_solver": SOLVER_NAMES[BatchThetaSettings().solver],
+        "theta_solver": "interior point (Clarabel)",
         "kinematic_error_max": by_moments.kinematics.largest,
         "kinematic_error_max_networks": by_networks.kinematics.largest,
         "kinematic_error_max_training": by_moments.training.largest,
@@ -355,7 +337,6 @@ def _comparison(learners: Sequence[LearnerScores], arms: Sequence[LearnerScores]
 
 # --- the 1 kHz learner on the whole robot --------------------------------------------------------
 
-HELD_OUT_EVERY = 10  # samples
 LOOK_EVERY = 5000  # samples between two looks at the errors
 PAUSE_NS = 1_000_000_000  # between two motions
 # Noise of signals behind a filter, standard deviations: rad, rad/s, rad/s² of joints; rad/s,
@@ -434,7 +415,7 @@ def online_trial(
     Returns:
         The figures (times in µs and s), and the learner.
     """
-    test = test.take(slice(None, None, HELD_OUT_EVERY))
+    test = test.take(slice(None, None, 10))
     learner = OnlineLearner(test.tree, settings=SETTINGS)
     seen = frame_observability(learner.tree, true_lam, gravity_down())
     times_ns: list[int] = []

@@ -11,8 +11,7 @@ import os
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,7 @@ from adapter.model.inertia import log_cholesky_from_theta
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.networks import (
-    inverse_dynamics,
-    link_motion,
-    theta_from_log_cholesky_torch,
-)
+from adapter.physics.networks import inverse_dynamics, link_motion, theta_from_log_cholesky_torch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.library import find_gap, learn
 from adapter.runs.pipeline import make_front_end
@@ -47,7 +42,6 @@ from drivers.files.mcap import Log, read_log
 from drivers.interface import JointSample
 
 WARM_UP = 2500  # samples, so that λ has settled and θ is being learned
-LEAST_REPEATS = 10
 MOST_SLOW_REPEATS = 100
 # Torque RMSE of joints 1 to 7, N m, that figaroh 1.0.2 leaves of the log of a real Panda (Gaz et
 # al. 2019) after 14 s, learned before; measured by `adapter bench --log`.
@@ -60,7 +54,7 @@ Signals = tuple[Array, Array, Array, Array]
 
 def run(args: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
-    rows = benchmark(max(args.repeats, LEAST_REPEATS))
+    rows = benchmark(max(args.repeats, 10))
     table = Table("what", "p50 µs", "p99 µs", "note", box=None, pad_edge=False)
     for row in rows:
         p50, p99 = row["p50_us"], row["p99_us"]
@@ -107,11 +101,12 @@ def _row(what: str, times_ns: list[int] | None, note: str) -> dict[str, Any]:
     return {"what": what, "p50_us": float(p50), "p99_us": float(p99), "note": note}
 
 
-def _timed(step: Callable[[int], object], repeats: int) -> list[int]:
+def _timed(step: Callable[[Any], object], over: Iterable[Any]) -> list[int]:
+    """ns of a step on each of these."""
     times = []
-    for k in range(repeats):
+    for x in over:
         before = time.perf_counter_ns()
-        step(k)
+        step(x)
         times.append(time.perf_counter_ns() - before)
     return times
 
@@ -122,10 +117,10 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
     samples = [JointSample(1_000_000 * k, q[k], dq[k], tau[k]) for k in range(WARM_UP + repeats)]
     states: list[Array] = []
 
-    def tick(k: int) -> None:
-        states.extend(front_end.step(samples[k]).copy())
+    def tick(sample: JointSample) -> None:
+        states.extend(front_end.step(sample).copy())
 
-    ticks = _timed(tick, WARM_UP + repeats)[WARM_UP:]
+    ticks = _timed(tick, samples)[WARM_UP:]
     rows = [_row("front end: checks, filter, twist synthesis", ticks, "per sample")]
     gain = JointFilter().noise_gain
     for effects, note in (((), "λ and θ"), (REAL_ARM_EFFECTS, "λ, θ and a real arm's effects")):
@@ -133,16 +128,11 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
         learner = OnlineLearner(robot.tree, robot.gravity, settings, Filtered(noise_gain=gain))
         for state in states[: WARM_UP // 2]:
             learner.step(state)
-        rest = states[WARM_UP // 2 :]
-        times = _timed(partial(_learn, learner, rest), len(rest))
+        times = _timed(learner.step, states[WARM_UP // 2 :])
         if learner.theta_started_ns is None:
             note += " (θ had not begun)"
         rows.append(_row("our update from the moments of all samples", times[-repeats:], note))
     return rows
-
-
-def _learn(learner: OnlineLearner, states: list[Array], k: int) -> None:
-    learner.step(states[k])
 
 
 def _autograd(robot: SelfModel, repeats: int) -> dict[str, Any]:
@@ -167,7 +157,8 @@ def _autograd(robot: SelfModel, repeats: int) -> dict[str, Any]:
         (cost + ((hat - tau[at]) ** 2).sum()).backward()
         adam.step()
 
-    return _row("autograd through the torch networks, ADAM", _timed(step, repeats), "one sample")
+    times = _timed(step, range(repeats))
+    return _row("autograd through the torch networks, ADAM", times, "one sample")
 
 
 def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
@@ -191,7 +182,7 @@ def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
         theta = theta + gain @ (tau[k] - Y @ theta)
         P = P - gain @ PY.T
 
-    return _row(what, _timed(step, repeats), "θ alone, no λ, no physical consistency")
+    return _row(what, _timed(step, range(repeats)), "θ alone, no λ, no physical consistency")
 
 
 def _peer(repeats: int) -> dict[str, Any]:
@@ -219,7 +210,7 @@ def _peer(repeats: int) -> dict[str, Any]:
         ((hat - tau) ** 2).sum().backward()
         adam.step()
 
-    return _row(what, _timed(step, repeats), "one sample, link masses alone")
+    return _row(what, _timed(step, range(repeats)), "one sample, link masses alone")
 
 
 # --- torque of a log that none of the ways to learn has seen --------------------------------------

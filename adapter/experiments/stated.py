@@ -10,7 +10,6 @@ from adapter.experiments.split import SETS
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL
 
-PAPER_SCHEMA_S, PAPER_THETA_START_S = 40.0, 100.0  # of the paper's real Panda
 PAPER_BASELINES = ("FFNN", "ELM", "GPR")
 
 
@@ -61,28 +60,20 @@ def atlas_stated(numbers: dict[str, Any]) -> list[Stated]:
         Stated("trajectories", "random trajectories", "63", numbers["trajectories"]),
         Stated("trajectory_s", "length of each, at 1 kHz", "10 s", seconds, "s"),
         Stated("control_trajectories", "of them control", "13", numbers["control_trajectories"]),
-        Stated(
-            "samples", "samples for training and test", "500 000",
-            numbers["train_samples"] + numbers["test_samples"],
-        ),
-        Stated(
-            "train_samples", "of them for training", "75 %", numbers["train_samples"], "",
-            "the paper prints 75 %/25 % as test/train",
-        ),
+        Stated("samples", "samples for training and test", "500 000",
+               numbers["train_samples"] + numbers["test_samples"]),
+        Stated("train_samples", "of them for training", "75 %", numbers["train_samples"], "",
+               "the paper prints 75 %/25 % as test/train"),
         Stated("learned_samples", "samples for λ and θ", "1 % of training",
                numbers["learned_samples"]),
         Stated("minibatch", "samples of a mini-batch; cycles", "10; 10",
                f"{numbers['minibatch']}; {numbers['cycles']}", "",
                "N problems (eq. 18) from random λ, each batch a step of recursive Gauss-Newton"),
         Stated("solver", "solver of θ", "interior point (fmincon)", numbers["theta_solver"]),
-        Stated(
-            "kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
-            "", "in m/s, rad/s, m/s² and rad/s², λ from moments",
-        ),
-        Stated(
-            "kinematic_error_max_networks", "the same, λ from mini-batches", "negligible",
-            networks,
-        ),
+        Stated("kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
+               "", "in m/s, rad/s, m/s² and rad/s², λ from moments"),
+        Stated("kinematic_error_max_networks", "the same, λ from mini-batches", "negligible",
+               networks),
         Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches), "",
                f"found from A; all bodies together {whole} times in the end, later ones weighted "
                "by what the one before left"),
@@ -115,37 +106,17 @@ def panda_stated(numbers: dict[str, Any]) -> list[Stated]:
     return [
         Stated("rate_hz", "rate of the online learning", "1 kHz", ours("rate_hz"), "Hz"),
         Stated("joints", "joints of the arm", "7", ours("joints")),
-        Stated(
-            "lambda_converged_s",
-            "λ converged after",
-            f"{PAPER_SCHEMA_S:g} s",
-            ours("lambda_converged_s"),
-            "s",
-            f"for good inside {ROTATION_GOAL_RAD:g} rad and {1e3 * POSITION_GOAL_M:g} mm in every "
-            "direction that the data show",
-        ),
-        Stated(
-            "theta_started_s",
-            "learning of θ begins at",
-            f"{PAPER_THETA_START_S:g} s",
-            ours("theta_started_s"),
-            "s",
-            "as soon as λ has converged, instead of at a time set by hand",
-        ),
-        Stated(
-            "theta_converged_s",
-            f"θ's torque error for good within {TORQUE_GOAL:g} times batch least squares after",
-            "not stated",
-            ours("theta_converged_s"),
-            "s",
-        ),
-        Stated(
-            "min_pseudo_inertia_eigenvalue",
-            "smallest eigenvalue of any link's pseudo-inertia, ever",
-            "a feasible set",
-            ours("min_pseudo_inertia_eigenvalue"),
-            "",
-            "above zero: every link is a possible body in every step",
-        ),
+        Stated("lambda_converged_s", "λ converged after", "40 s", ours("lambda_converged_s"), "s",
+               f"for good inside {ROTATION_GOAL_RAD:g} rad and {1e3 * POSITION_GOAL_M:g} mm in "
+               "every direction that the data show"),
+        Stated("theta_started_s", "learning of θ begins at", "100 s", ours("theta_started_s"), "s",
+               "as soon as λ has converged, instead of at a time set by hand"),
+        Stated("theta_converged_s",
+               f"θ's torque error for good within {TORQUE_GOAL:g} times batch least squares after",
+               "not stated", ours("theta_converged_s"), "s"),
+        Stated("min_pseudo_inertia_eigenvalue",
+               "smallest eigenvalue of any link's pseudo-inertia, ever", "a feasible set",
+               ours("min_pseudo_inertia_eigenvalue"), "",
+               "above zero: every link is a possible body in every step"),
         found_trees(numbers["discover"]),
-    ]
+    ]  # fmt: skip

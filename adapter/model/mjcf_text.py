@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adapter.model.inertia import body_from_theta
-from adapter.model.self_model import SelfModel, base_inertia, link_theta, turned_theta
+from adapter.model.self_model import SelfModel, base_inertia, turned_theta
 from adapter.model.spatial import Array, quaternion_from_matrix, rot_z, z_to_axis
 from adapter.model.tree import BASE
 from adapter.model.urdf_text import (
@@ -17,6 +17,7 @@ from adapter.model.urdf_text import (
     FRICTION,
     STIFFNESS,
     Additions,
+    carried,
     check_possible,
     comment_text,
     number_text,
@@ -60,8 +61,8 @@ def mjcf_text(model: SelfModel, more: Additions) -> str:
         zero = model.joint_rotation()[k] @ rot_z(-more.offset[k])  # q = q_measured - offset
         placed = turns[parent] @ zero @ turns[name].T, turns[parent] @ model.lam[k, 3:]
         on[name] = _body(on[parent], name, *placed)
-        theta = turned_theta(link_theta(model)[k] + more.dtheta[k], turns[name])
-        on[name].append(inertial(theta, name))
+        theta = turned_theta(model.theta[k - tree.n] + more.dtheta[k], turns[name])
+        on[name].append(_inertial(theta, name))
         hinge = {"name": tree.joint_names[k], "type": "hinge", "axis": number_text(model.axis[k])}
         span = np.array([model.limits.lower[k], model.limits.upper[k]])
         if np.isfinite(span).all():
@@ -75,13 +76,10 @@ def mjcf_text(model: SelfModel, more: Additions) -> str:
     for frame in model.frames:
         turn = turns[frame.parent]
         _body(on[frame.parent], frame.name, turn @ frame.rotation, turn @ frame.position)
-    loads = [(tree.link_names[-1], "payload", load) for load in more.loads]
-    if model.tool is not None:
-        loads.append((model.tool_link, "tool", model.tool.theta()))
-    for k, (link, what, theta) in enumerate(loads):
-        name = f"{link}_{what}" + (f"_{k + 1}" if what == "payload" and k else "")
+    tool, loads = carried(model, more)
+    for link, name, theta in (*loads, *tool):
         load = _body(on[link], name, np.eye(3), np.zeros(3))
-        load.append(inertial(turned_theta(theta, turns[link]), name))
+        load.append(_inertial(turned_theta(theta, turns[link]), name))
     ET.indent(robot)
     return ET.tostring(robot, encoding="unicode") + "\n"
 
@@ -95,7 +93,7 @@ def _base(world: ET.Element, model: SelfModel, more: Additions) -> dict[str, ET.
     tilt = np.eye(3) if more.tilt is None else more.tilt
     body = _body(world, name_there, tilt, np.zeros(3))
     if np.any(theta):
-        body.append(inertial(theta, name))
+        body.append(_inertial(theta, name))
     if model.tree.floating:
         ET.SubElement(body, "freejoint")
     return {name: body}
@@ -106,7 +104,7 @@ def _body(on: ET.Element, name: str, rotation: Array, position: ArrayLike) -> ET
     return ET.SubElement(on, "body", {"name": name, **place})
 
 
-def inertial(theta: Array, name: str) -> ET.Element:
+def _inertial(theta: Array, name: str) -> ET.Element:
     """<inertial> of a body (10,) in its own frame, about its principal axes."""
     check_possible(theta, name)
     return ET.Element("inertial", inertial_attributes(theta))

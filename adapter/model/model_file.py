@@ -87,9 +87,8 @@ def loads(text: str) -> SelfModel:
 
 
 def _to_json(model: SelfModel) -> dict[str, Any]:
-    tree, source = model.tree, None
-    if model.source is not None:
-        given = model.source
+    tree, source, given = model.tree, None, model.source
+    if given is not None:
         text = None if given.text is None else given.text.splitlines(keepends=True)
         lam = _numbers(given.lam)
         source = {"format": given.format, "file": given.file, "lambda": lam, "text": text}
@@ -108,10 +107,10 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         },
         "lambda": _numbers(model.lam),
         "lambda_std": _numbers(model.lam_std),
-        "lambda_identifiable": _flags(model.lam_identifiable),
+        "lambda_identifiable": _plain(model.lam_identifiable),
         "theta": _numbers(model.theta),
         "theta_std": _numbers(model.theta_std),
-        "theta_identifiable": _flags(model.theta_identifiable),
+        "theta_identifiable": _plain(model.theta_identifiable),
         "base_theta": _numbers(model.base_theta),
         "effects": _plain(model.effects),
         "gravity": _numbers(model.gravity),
@@ -246,10 +245,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return _plain(value.item())
     return _numbers(value) if isinstance(value, float) else value
-
-
-def _flags(array: np.ndarray | None) -> Any:
-    return None if array is None else array.tolist()
 
 
 def _text(value: Any, indent: int) -> str:

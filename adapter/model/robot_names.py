@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 ROBOT_FILES = ", a .urdf file, an MJCF file (.xml) or a .json model file"
-_FOLDER = Path(__file__).parent / "robots"
+FOLDER = Path(__file__).parent / "robots"
 
 
 def robot_names() -> tuple[str, ...]:
     """The robots that are known by name."""
-    return tuple(sorted(path.stem for path in _FOLDER.glob("*.urdf")))
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.urdf")))

@@ -321,11 +321,6 @@ def base_inertia(model: SelfModel) -> Array:
     return model.theta[0] if model.tree.floating else model.base_theta
 
 
-def link_theta(model: SelfModel) -> Array:
-    """Rows (n, 10) of θ of the moving links."""
-    return model.theta[1:] if model.tree.floating else model.theta
-
-
 def turned_theta(theta: Array, rotation: Array) -> Array:
     """Ten parameters (10,) in axes turned about the same origin: R takes old axes to new."""
     return move_theta(theta, rotation, np.zeros(3))

@@ -70,9 +70,7 @@ def zxz_from_matrix(rotation: ArrayLike) -> Array:
     singular = sine < EULER_SINGULAR_SINE
     beta = np.arctan2(np.where(singular, 0.0, sine), r[..., 2, 2])
     alpha = np.where(
-        singular,
-        np.arctan2(r[..., 1, 0], r[..., 0, 0]),
-        np.arctan2(r[..., 0, 2], -r[..., 1, 2]),
+        singular, np.arctan2(r[..., 1, 0], r[..., 0, 0]), np.arctan2(r[..., 0, 2], -r[..., 1, 2])
     )
     rest = np.swapaxes(rot_z(alpha) @ rot_x(beta), -1, -2) @ r
     gamma = np.where(singular, 0.0, np.arctan2(rest[..., 1, 0], rest[..., 0, 0]))

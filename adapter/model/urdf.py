@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.inertia import move_theta, tensor_from_six, theta_from_body
 from adapter.model.robot_file import SLIDING, TURNING, FileJoint, FileRobot, Merged
-from adapter.model.self_model import URDF, SelfModel, Source, check_limits, gravity_down
+from adapter.model.self_model import LIMITS, URDF, SelfModel, Source, check_limits, gravity_down
 from adapter.model.spatial import Array, matrix_from_rpy, vector3
 from drivers.files.bounded import read_text
 
@@ -182,11 +182,11 @@ def _joint(element: ET.Element, links: dict[str, Array], file: str) -> FileJoint
     axis = _axis(element, where) if kind in (*TURNING, *SLIDING) else np.array([1.0, 0.0, 0.0])
     limits, followed, mimic = _limits(element, kind, where), element.find("mimic"), None
     if followed is not None:
-        numbers = {"multiplier": 1.0, "offset": 0.0}
-        for key in numbers:
-            if followed.get(key) is not None:
-                numbers[key] = _number(followed, key, where)
-        mimic = followed.get("joint", ""), numbers["multiplier"], numbers["offset"]
+        factor, offset = (
+            usual if followed.get(key) is None else _number(followed, key, where)
+            for key, usual in (("multiplier", 1.0), ("offset", 0.0))
+        )
+        mimic = followed.get("joint", ""), factor, offset
     return FileJoint(
         name, kind, ends["parent"], ends["child"], rotation, position, axis, limits, mimic
     )
@@ -207,18 +207,12 @@ def _axis(element: ET.Element, where: str) -> Array:
 
 
 def _limits(element: ET.Element, kind: str, where: str) -> Array:
-    found = element.find("limit")
-    out = np.full(4, math.nan)
-    if found is None:
-        return out
-    # A continuous joint has no position limits, whatever its file says.
-    keys = (
-        ("velocity", "effort") if kind == "continuous" else ("lower", "upper", "velocity", "effort")
-    )
-    for key in keys:
-        if found.get(key) is not None:
-            place = ("lower", "upper", "velocity", "effort").index(key)
-            out[place] = _number(found, key, where)
+    found, out = element.find("limit"), np.full(4, math.nan)
+    if found is not None:
+        for place, key in enumerate(LIMITS):
+            # a continuous joint has no position limits, whatever its file says
+            if found.get(key) is not None and (kind != "continuous" or key in LIMITS[2:]):
+                out[place] = _number(found, key, where)
     return out
 
 

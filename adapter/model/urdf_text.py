@@ -21,13 +21,7 @@ from adapter.model.inertia import (
     min_eigenvalue,
     six_from_tensor,
 )
-from adapter.model.self_model import (
-    SelfModel,
-    base_inertia,
-    gravity_down,
-    link_theta,
-    turned_theta,
-)
+from adapter.model.self_model import LIMITS, SelfModel, base_inertia, gravity_down, turned_theta
 from adapter.model.spatial import Array, rot_z, rpy_from_matrix, z_to_axis
 from adapter.model.tree import BASE
 
@@ -120,26 +114,36 @@ def urdf_text(model: SelfModel, more: Additions) -> str:
     else:
         _add_massless(robot, tree.base_name)
     for k, name in enumerate(tree.link_names):
-        _add_link(robot, name, turned_theta(link_theta(model)[k] + more.dtheta[k], turns[name]))
+        theta = model.theta[k - tree.n] + more.dtheta[k]
+        _add_link(robot, name, turned_theta(theta, turns[name]))
         _add_joint(robot, model, k, turns, more)
     for frame in model.frames:
         _add_massless(robot, frame.name)
         turn = turns[frame.parent]
         joint = _joint(robot, frame.joint, "fixed", frame.parent, frame.name)
         _add_origin(joint, turn @ frame.rotation, turn @ frame.position)
-    if model.tool is not None:
-        link = model.tool_link
-        _add_load(robot, link, "tool", turned_theta(model.tool.theta(), turns[link]))
-    last = tree.link_names[-1]
-    for k, load in enumerate(more.loads):
-        what = "payload" if k == 0 else f"payload_{k + 1}"
-        _add_load(robot, last, what, turned_theta(load, turns[last]))
+    tool, loads = carried(model, more)
+    for link, name, theta in (*tool, *loads):
+        _add_link(robot, name, turned_theta(theta, turns[link]))
+        _add_origin(_joint(robot, f"{name}_joint", "fixed", link, name), np.eye(3))
     if more.tilt is not None:
         upright = f"{tree.base_name}_upright"
         _add_massless(robot, upright)
         _add_origin(_joint(robot, f"{upright}_joint", "fixed", upright, tree.base_name), more.tilt)
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+Carried = list[tuple[str, str, Array]]  # link, name of a body on it, and θ (10,) in its frame
+
+
+def carried(model: SelfModel, more: Additions) -> tuple[Carried, Carried]:
+    """The tool where there is one, and the loads; in files they are bodies of their own."""
+    last, tool = model.tree.link_names[-1], Carried()
+    if model.tool is not None:
+        tool.append((model.tool_link, f"{model.tool_link}_tool", model.tool.theta()))
+    names = (f"{last}_payload_{k + 1}" if k else f"{last}_payload" for k in range(len(more.loads)))
+    return tool, [(last, name, load) for name, load in zip(names, more.loads, strict=True)]
 
 
 def unplaced(model: SelfModel, more: Additions) -> list[str]:
@@ -202,13 +206,6 @@ def six_named(tensor: Array) -> dict[str, float]:
     return dict(zip(keys, six_from_tensor(tensor).tolist(), strict=True))
 
 
-def _add_load(robot: ET.Element, link: str, what: str, theta: Array) -> None:
-    """A body that a link carries, as a link of its own on a fixed joint."""
-    name = f"{link}_{what}"
-    _add_link(robot, name, theta)
-    _add_origin(_joint(robot, f"{name}_joint", "fixed", link, name), np.eye(3))
-
-
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
@@ -236,12 +233,7 @@ def _add_joint(
     }
     if losses:
         ET.SubElement(joint, "dynamics", losses)
-    values = {
-        "lower": limits.lower[k],
-        "upper": limits.upper[k],
-        "velocity": limits.velocity[k],
-        "effort": limits.effort[k],
-    }
+    values = {key: getattr(limits, key)[k] for key in LIMITS}
     known = {key: number_text(value) for key, value in values.items() if math.isfinite(value)}
     if known:
         ET.SubElement(joint, "limit", known)

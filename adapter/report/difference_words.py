@@ -8,15 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.runs.compare import (
-    BODY,
-    FRAME,
-    GRAVITY,
-    NOTHING,
-    SIGNIFICANT,
-    Change,
-    ModelDifference,
-)
+from adapter.runs.compare import BODY, FRAME, GRAVITY, NOTHING, SIGNIFICANT, Change, ModelDifference
 
 MATRIX_HEADS = ("joint", "its frame in the one before", "the link behind it")
 EFFECT_HEADS = ("effect", "from A to B, joint by joint", "z", "N m")

@@ -8,22 +8,14 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import KNOWN
-from adapter.report.fleet_words import (
-    EPOCH_S,
-    HEADS,
-    log_cells,
-    sentences,
-    summary,
-    to_be_shown,
-)
+from adapter.report.fleet_words import EPOCH_S, HEADS, log_cells, sentences, summary, to_be_shown
 from adapter.report.html import fill, write_whole
-from adapter.report.style import MUTED, Drawing, Panel, joint_color
+from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
 from adapter.report.words import with_doubt
 from adapter.runs.fleet.arm import DAY_S, FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
-TEMPLATE = "fleet.html"
 MOST_ROWS = 300  # of recordings; of more those that there is something to say of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
 
@@ -36,7 +28,7 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
         "broken": Table(("recording", "why"), list(found.broken)),
         "forgotten": found.forgotten,
     }
-    return write_whole(path, fill(TEMPLATE, context))
+    return write_whole(path, fill("fleet.html", context))
 
 
 def _arm(arm: FleetArm) -> dict[str, Any]:
@@ -85,14 +77,7 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
             )
             look = ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)
             look.set_label(str(j + 1))
-        ax.legend(
-            ncols=8,
-            fontsize=6,
-            frameon=False,
-            labelcolor=MUTED,
-            loc="lower center",
-            bbox_to_anchor=(0.5, 0.98),
-        )
+        legend(ax, ncols=8, fontsize=6, loc="lower center", bbox_to_anchor=(0.5, 0.98))
         drawing.figure.subplots_adjust(top=0.9)  # for the legend
         ax.set_xlabel(label)
         effect = KNOWN[name]

@@ -19,6 +19,7 @@ from adapter.runs.fleet.fleet import Fleet
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
 FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
+MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording, as figures
 
 
 def log_cells(log: OfLog) -> tuple[str, ...]:
@@ -146,11 +147,7 @@ def _arm_json(arm: FleetArm) -> dict[str, Any]:
         ],
         "logs": [
             {
-                "path": log.moments.path,
-                "content": log.moments.content,
-                "begin_s": log.moments.begin_s,
-                "span_s": log.moments.span_s,
-                "samples": log.moments.samples,
+                **{key: getattr(log.moments, key) for key in MOMENTS},
                 "load": None if log.load is None else log.load._asdict(),
                 "rmse_nm": log.rmse,
                 "own_rmse_nm": log.own_rmse,

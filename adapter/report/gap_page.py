@@ -9,56 +9,25 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.law import LAWS
+from adapter.gap import words
 from adapter.gap.phrases import listed, who
 from adapter.gap.result import GapResult, Leftover
-from adapter.gap.words import (
-    by_kind,
-    fall,
-    headline_parts,
-    left_above_noise,
-    noise_times,
-    percent,
-    signal_words,
-    stopped,
-    worse,
-    worst_joint,
-)
 from adapter.model.numbers import DASH, plain
 from adapter.model.robots import names as robot_names
+from adapter.report import gap_tables as tables
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
-from adapter.report.gap_tables import (
-    carried_table,
-    correction_ratio,
-    correction_table,
-    error_table,
-    finding_rows,
-    joint_matrix,
-    rival_rows,
-    tied,
-    unseen_table,
-)
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import Step, command
 from adapter.report.tables import Tile
 from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
 from adapter.report.words import NARROW, capital
 
-TEMPLATE = "gap.html"
 WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
-OURS = (
-    "joint",
-    "link",
-    "the ",
-    "something",
-    "from ",
-    "until ",
-    "no ",
-    "a spring",
-    "all joints",
-    WORTH,
-    "but ",
+OURS = (  # how clauses begin that are words of ours, no names
+    *("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints"),
+    *(WORTH, "but "),
 )
 
 
@@ -67,7 +36,7 @@ def render_gap_page(result: GapResult, folder: Path | None = None) -> str:
 
     `folder`: where the page and the result's figures are, for commands that take these.
     """
-    return fill(TEMPLATE, context(result, folder))
+    return fill("gap.html", context(result, folder))
 
 
 def write_gap_page(result: GapResult, path: str | Path) -> Path:
@@ -83,7 +52,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     """What the template shows."""
     told = result.problem is None
     shown = _tiles(result) if told else []
-    correction, ratio = correction_table(result), correction_ratio(result)
+    correction, ratio = tables.correction_table(result), tables.correction_ratio(result)
     found = "what was found" if result.findings else ""
     corrected = "the small correction of the inertias" if correction else ""
     largest = 0.0 if ratio is None or not ratio.size else float(np.abs(ratio).max())
@@ -97,22 +66,22 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "several": len(result.recordings) > 1,
         "tiles": shown,
         "columns": max(len(shown), 1),
-        "findings": finding_rows(result),
-        "matrix": joint_matrix(result),
-        "carried": carried_table(result),
+        "findings": tables.finding_rows(result),
+        "matrix": tables.joint_matrix(result),
+        "carried": tables.carried_table(result),
         "contradictions": [capital(text) for text in result.contradictions],
         "told": told,
-        "error_table": error_table(result) if told else None,
+        "error_table": tables.error_table(result) if told else None,
         "after_words": "with "
         + (" and ".join(filter(None, (found, corrected))) or "nothing added"),
         "errors": error_panels(result) if told else [],
         "signatures": signature_panels(result),
         "marked": any(f.interval_s[0] > 0.0 or not f.lasting for f in result.findings),
         "rollouts": bool(result.rollouts),
-        "rivals": rival_rows(result),
+        "rivals": tables.rival_rows(result),
         "unexplained": [_leftover(item) for item in result.unexplained],
         "unexplained_panels": unexplained_panels(result),
-        "unseen": unseen_table(result),
+        "unseen": tables.unseen_table(result),
         "correction": correction if told else None,
         "correction_words": ""
         if ratio is None or not told
@@ -131,24 +100,24 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
 
 def _headline(result: GapResult) -> list[str]:
     """Sentences on a page: capital, arrow, no break before a unit."""
-    parts = headline_parts(result)
+    parts = words.headline_parts(result)
     worth = [k for k, part in enumerate(parts) if part.startswith(WORTH)]
     if worth:  # right behind the first finding
         parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
         return parts
     said = [capital(text) if text.startswith(OURS) else text for text in parts]
-    return [f"{tied(text.replace(' -> ', ' → '))}." for text in said]
+    return [f"{tables.tied(text.replace(' -> ', ' → '))}." for text in said]
 
 
 def _leftover(item: Leftover) -> str:
     begin, end = item.interval_s
-    signals = [f"the {signal_words(name)} ({name})" for name in item.depends_on]
+    signals = [f"the {words.signal_words(name)} ({name})" for name in item.depends_on]
     times = item.rmse_nm / item.noise_floor_nm if item.noise_floor_nm > 0.0 else np.nan
     size = f", {plain(times, 2)} times its noise," if np.isfinite(times) else ""
     follows = f"that follow {listed(signals) or 'no signal'}"
     said = f"{plain(item.rmse_nm, 2)} N m{size} {follows}, from {begin:.1f} to {end:.1f} s"
-    return tied(f"Joint {item.joint}: {said}.")
+    return tables.tied(f"Joint {item.joint}: {said}.")
 
 
 def _tiles(result: GapResult) -> list[Tile]:
@@ -157,19 +126,19 @@ def _tiles(result: GapResult) -> list[Tile]:
     left = len(result.unexplained)
     said = f"{left} thing{'' if left == 1 else 's'} unexplained"
     if not left:
-        said = left_above_noise(result) or "nothing above the noise left"
-    tiles = [Tile("Effects found", str(len(by_kind(result.findings))), said)]
-    worst = worst_joint(result)
+        said = words.left_above_noise(result) or "nothing above the noise left"
+    tiles = [Tile("Effects found", str(len(words.by_kind(result.findings))), said)]
+    worst = words.worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
-        fell = f"{fall(first, last)} N m".replace("->", "→").replace(" ", NARROW)
+        fell = f"{words.fall(first, last)} N m".replace("->", "→").replace(" ", NARROW)
         tiles.append(Tile("Torque error", fell, f"joint {worst + 1}, the worst; rms"))
     if worst is not None and noise[worst] > 0.0:
         tiles.append(
             Tile(
                 "In units of its noise",
                 _arrow(first / noise[worst], last / noise[worst], "×"),
-                tied(f"joint {worst + 1}, noise {plain(noise[worst], 2)} N m"),
+                tables.tied(f"joint {worst + 1}, noise {plain(noise[worst], 2)} N m"),
             )
         )
     off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
@@ -177,7 +146,7 @@ def _tiles(result: GapResult) -> list[Tile]:
         j = int(np.nanargmax(off))
         still = np.nan if off_after is None else off_after[j]
         value, note = _arrow(1e3 * off[j], 1e3 * still, "mrad"), f"joint {j + 1}, rms within 0.5 s"
-        tiles.append(Tile("Forward simulation off by", value, tied(note)))
+        tiles.append(Tile("Forward simulation off by", value, tables.tied(note)))
     return tiles
 
 
@@ -199,19 +168,19 @@ def gap_checks(result: GapResult) -> list[Check]:
     checks += [_scored(result), _left(result)]
     checks += [Check(BAD, "Contradiction", text) for text in result.contradictions]
     if result.stopped_after_rounds:
-        checks.append(Check(LOOK, "The search", stopped(result)))
+        checks.append(Check(LOOK, "The search", words.stopped(result)))
     return checks
 
 
 def _evidence(result: GapResult) -> Check:
     least = min(result.findings, key=lambda f: f.evidence)
     called = f"{least.title}, {who(least.effect, least.joints)}"
-    said = f"the least sure of {len(result.findings)}: {called}, {percent(least.evidence)}"
+    said = f"the least sure of {len(result.findings)}: {called}, {words.percent(least.evidence)}"
     return Check(GOOD if least.evidence >= SURE else LOOK, "How sure", said)
 
 
 def _rivals(result: GapResult) -> Check:
-    rows = rival_rows(result)
+    rows = tables.rival_rows(result)
     if not rows:
         said = "no other effect of the catalogue explains 90 % of any of these on these data"
         return Check(GOOD, "What else explains it", said)
@@ -224,7 +193,7 @@ def _scored(result: GapResult) -> Check:
     if result.in_sample:
         said = "in sample only: nothing could be held out, so that errors after may be too small"
         return Check(LOOK, "On data not fitted", said)
-    lost = worse(result)
+    lost = words.worse(result)
     said = "errors before and after are of data that the fit never saw"
     said += f"; {lost}" if lost else ""
     return Check(LOOK if lost else GOOD, "On data not fitted", said)
@@ -232,9 +201,9 @@ def _scored(result: GapResult) -> Check:
 
 def _left(result: GapResult) -> Check:
     """What the new model leaves, named as unexplained or not."""
-    after = noise_times(result)[1]
+    after = words.noise_times(result)[1]
     joints = sorted({item.joint for item in result.unexplained})
-    loud = left_above_noise(result)
+    loud = words.left_above_noise(result)
     if joints:
         where = f"joint{'s' if len(joints) > 1 else ''} {', '.join(map(str, joints))}"
         said = f"something that no effect explains on {where}{'; ' + loud if loud else ''}"
@@ -260,8 +229,8 @@ def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
     if laws:
         why = "Keep the law under a name, to look for it in other recordings (--effects)"
         name, joint = f"law_joint_{laws[0].joints[0]}", str(laws[0].joints[0])
-        words = ("effects", "keep", figures, "--as", name, "--joint", joint)
-        steps.append(Step(why, command(*words)))
+        keep = command("effects", "keep", figures, "--as", name, "--joint", joint)
+        steps.append(Step(why, keep))
     out = result.model_out
     if out is not None:
         why = "See joint by joint what the new model holds otherwise"
@@ -280,7 +249,7 @@ def _asked(texts: Sequence[str]) -> list[str]:
     found = []
     for motion, clauses in told.items():
         signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
-        found.append(tied(capital(f"{motion}: the {signs}" if signs else motion)))
+        found.append(tables.tied(capital(f"{motion}: the {signs}" if signs else motion)))
     return found
 
 

@@ -17,6 +17,7 @@ from adapter.report.style import (
     Drawing,
     Panel,
     categories,
+    log_ticks,
     named,
     power_of_ten,
     time_axis,
@@ -75,7 +76,7 @@ def fall_drawing(before: Array, after: Array, noise: Array | None, names: Sequen
 
 def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     """Limits that hold everything, and ticks at 1, 2 and 5 times powers of ten."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+    from matplotlib.ticker import FixedLocator
 
     values = np.concatenate([np.asarray(x, dtype=float) for x in tables])
     values = values[np.isfinite(values) & (values > 0.0)]
@@ -84,6 +85,4 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     wide = len(powers) > 4
     ticks = [s * 10.0**p for p in powers for s in ((1.0,) if wide else (1.0, 2.0, 5.0))]
     ax.set_ylim(low, high)
-    ax.yaxis.set_major_locator(FixedLocator([t for t in ticks if low <= t <= high]))
-    ax.yaxis.set_minor_locator(NullLocator())
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)

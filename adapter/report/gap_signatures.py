@@ -15,17 +15,7 @@ from adapter.gap.result import Finding, GapResult, RolloutCurves
 from adapter.gap.words import signal_words
 from adapter.model.numbers import plain
 from adapter.model.spatial import Array
-from adapter.report.style import (
-    ACCENT,
-    GOAL,
-    INK,
-    MUTED,
-    SIZES,
-    Drawing,
-    Panel,
-    thin,
-    time_axis,
-)
+from adapter.report.style import ACCENT, GOAL, INK, MUTED, SIZES, Drawing, Panel, thin, time_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

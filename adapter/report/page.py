@@ -10,28 +10,18 @@ import numpy as np
 
 from adapter.gap.monitor_judge import sentence
 from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.report import tables, words
+from adapter.report import tables, torque_panels, words
 from adapter.report.headline import against, headline
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import next_steps
 from adapter.report.schema_panels import schema_panels
 from adapter.report.skeleton import has_reference, skeleton_panels
 from adapter.report.style import ACCENT, JOINT_COLORS, Drawing, Panel, time_axis
-from adapter.report.torque_panels import (
-    BODY_PARTS,
-    body_panels,
-    effect_panels,
-    fit_panels,
-    fit_window,
-    prequential_panels,
-    theta_started,
-)
 from adapter.report.trust import checks
 from adapter.report.worth import Worth, worth_panels, worth_table
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL
 
-TEMPLATE = "report.html"
 TRACKED = {
     "feedback": "feedback alone",
     "feedforward": "with feed-forward",
@@ -42,7 +32,7 @@ TRACKED = {
 
 def render(data: RunData) -> str:
     """The page as HTML text; parts that the run does not have are left out."""
-    return fill(TEMPLATE, context(data))
+    return fill("report.html", context(data))
 
 
 def write_report(path: str | Path, data: RunData) -> Path:
@@ -56,8 +46,8 @@ def write_report(path: str | Path, data: RunData) -> Path:
 
 def context(data: RunData) -> dict[str, Any]:
     """What the template shows."""
-    figures, started, worth = data.figures, theta_started(data), Worth.of(data)
-    fit = data.times(data.score_trace)[fit_window(data)] if started else []
+    figures, started, worth = data.figures, torque_panels.theta_started(data), Worth.of(data)
+    fit = data.times(data.score_trace)[torque_panels.fit_window(data)] if started else []
     fault, start_s = figures.get("fault"), figures.get("start_s") or 0.0
     ended = [f"The run ended early: {fault}"] if fault else []
     new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
@@ -81,11 +71,11 @@ def context(data: RunData) -> dict[str, Any]:
         "has_reference": has_reference(data),
         "started": started,
         "torque_goal": f"{TORQUE_GOAL:g}",
-        "body_parts": BODY_PARTS,
-        "bodies": body_panels(data) if started else [],
-        "effects": effect_panels(data) if started else [],
-        "prequential": prequential_panels(data) if started else [],
-        "fit": fit_panels(data) if started else [],
+        "body_parts": torque_panels.BODY_PARTS,
+        "bodies": torque_panels.body_panels(data) if started else [],
+        "effects": torque_panels.effect_panels(data) if started else [],
+        "prequential": torque_panels.prequential_panels(data) if started else [],
+        "fit": torque_panels.fit_panels(data) if started else [],
         "fit_span": f"{words.number(fit[0])} to {words.quantity(fit[-1], 's')}" if len(fit) else "",
         "joint_tables": tables.joint_tables(data),
         "matrices": [tables.schema_matrix(data), tables.theta_matrix(data)],

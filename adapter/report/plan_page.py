@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from adapter.control.cell import Box, Cell, Mesh
+from adapter.control.excitation import plan_lines
 from adapter.control.free_path import ArmInCell, Clearance
 from adapter.control.limits import MotionLimits
 from adapter.control.meshes import read_mesh
@@ -20,7 +21,6 @@ from adapter.report.next_steps import Step
 from adapter.report.skeleton import Projection, from_a_corner, ground
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
 
-TEMPLATE = "plan.html"
 POSES = 80  # drawn along the path
 GOLDEN = 0.618034  # spreads them over the path without a step that a period could share
 RIM = 24  # corners of a circle
@@ -31,38 +31,40 @@ VIEWS: tuple[tuple[str, Projection, str], ...] = (
 )
 
 
-class PlanWords(NamedTuple):
-    """What is said of a motion, line by line, and what to do next."""
+class Plan(NamedTuple):
+    """A motion in its cell, and what it comes nearest to."""
 
-    lines: Sequence[str]
-    steps: Sequence[Step] = ()
+    arm: ArmInCell
+    motion: PathMotion
+    limits: MotionLimits
+    nearest: Clearance
 
+    def lines(self, duration_s: float, more: Sequence[str] = ()) -> list[str]:
+        """Where it goes, with what it comes nearest to and more of its kind before the last."""
+        names = self.arm.model.tree.joint_names
+        lines = plan_lines(self.motion, self.limits, names, duration_s)
+        nearest = f"Nearest on the way: {self.nearest} (margin {self.arm.cell.margin:g} m)."
+        return [*lines[:-1], nearest, *more, lines[-1]]
 
-def write_plan(
-    path: str | Path,
-    arm: ArmInCell,
-    motion: PathMotion,
-    limits: MotionLimits,
-    nearest: Clearance,
-    said: PlanWords,
-) -> Path:
-    """Write the page of a motion in its cell. Raises RunFolderError."""
-    start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
-    span_s = max(nearest.path_s, 30.0)
-    poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
-    names = arm.model.tree.joint_names
-    of_joints = [line for line in said.lines if line.startswith(names)]
-    context: dict[str, Any] = {
-        "robot": arm.model.name,
-        "nearest": f"{nearest} after {nearest.path_s:.1f} s of path, margin {arm.cell.margin:g} m",
-        "ignored": [" and ".join(pair) for pair in arm.ignored],
-        "views": [_view(arm, poses, closest, start, view) for view in VIEWS],
-        "joints": _joint_panels(motion, limits, names),
-        "lines": [line for line in said.lines if line not in of_joints],
-        "of_joints": of_joints,
-        "steps": said.steps,
-    }
-    return write_whole(path, fill(TEMPLATE, context))
+    def write(self, path: Path, lines: Sequence[str], steps: Sequence[Step] = ()) -> Path:
+        """Write its page with these lines and what to do next. Raises RunFolderError."""
+        arm, motion, limits, nearest = self
+        start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
+        span_s = max(nearest.path_s, 30.0)
+        poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
+        names, margin = arm.model.tree.joint_names, arm.cell.margin
+        of_joints = [line for line in lines if line.startswith(names)]
+        context: dict[str, Any] = {
+            "robot": arm.model.name,
+            "nearest": f"{nearest} after {nearest.path_s:.1f} s of path, margin {margin:g} m",
+            "ignored": [" and ".join(pair) for pair in arm.ignored],
+            "views": [_view(arm, poses, closest, start, view) for view in VIEWS],
+            "joints": _joint_panels(motion, limits, names),
+            "lines": [line for line in lines if line not in of_joints],
+            "of_joints": of_joints,
+            "steps": steps,
+        }
+        return write_whole(path, fill("plan.html", context))
 
 
 def _view(

@@ -23,14 +23,10 @@ from adapter.report.style import (
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
-DASHES: tuple[tuple[float, Sequence[float]], ...] = (  # x, y, z
-    (0, ()),
-    (0, (4, 1.5)),
-    (0, (1, 1.3)),
-)
+DASHES: Sequence[tuple[float, Sequence[float]]] = ((0, ()), (0, (4, 1.5)), (0, (1, 1.3)))  # x, y, z
 SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time to converge
 FIRST_S = 0.05  # left end of a logarithmic time axis
-LOWEST = {"rad": 1e-5, "m": 1e-5}  # of an error that is shown; below it a line leaves the panel
+LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
 SETTLED = "inside both goals"
 
 
@@ -57,10 +53,9 @@ def schema_panels(data: RunData) -> list[Panel]:
     ]
     if data.reference is None:
         return panels
-    turn, shift = data.schema_errors
     goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")
     titles = "Orientation error", "Position error"
-    for title, error, (goal, unit) in zip(titles, (turn, shift), goals, strict=True):
+    for title, error, (goal, unit) in zip(titles, data.schema_errors, goals, strict=True):
         drawing = _errors(t, error, goal, unit, converged)
         panels.append(drawing.panel(title, unit, "in what the data had shown by then"))
     return panels
@@ -92,8 +87,7 @@ def _components(t: Array, values: Array, converged: float | None) -> Drawing:
             line.set_linestyle(dashes)
     ax.set_xlim(min(0.0, t[0]), t[-1])
     ax.margins(y=0.12)  # room for the words of the mark
-    if converged is not None:
-        mark(ax, converged, SETTLED)
+    mark(ax, converged, SETTLED)
     time_axis(drawing)
     return drawing
 
@@ -104,12 +98,11 @@ def _errors(t: Array, error: Array, goal: float, unit: str, converged: float | N
     ax = drawing.axes[0]
     top = max(float(error.max()), 10 * goal)
     shown = t >= FIRST_S
-    lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST[unit]))
-    log_axis(ax, LOWEST[unit], 2 * top)
+    lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST))
+    log_axis(ax, LOWEST, 2 * top)
     log_time(ax, FIRST_S, t[-1])
     late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
     level(ax, goal, f"goal {goal:g} {unit}", left=late)
-    if converged is not None:
-        mark(ax, converged, SETTLED)
+    mark(ax, converged, SETTLED)
     time_axis(drawing)
     return drawing

@@ -10,7 +10,7 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,9 @@ from adapter.model.spatial import Array
 
 if TYPE_CHECKING:  # loaded where a panel is drawn: takes long, and not every run has a page
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+    from matplotlib.ticker import Locator
 
 JOINT_COLORS = 8  # the page defines --j1 to --j8; more joints go round again
 _NAMES = ("ink", "muted", "grid", "accent", "goal", *(f"j{k + 1}" for k in range(JOINT_COLORS)))
@@ -159,26 +161,36 @@ def time_axis(drawing: Drawing, label: str = "time after the first motion, s") -
     ax.set_xlabel(label, color=MUTED, labelpad=1.5, fontsize=SIZES[drawing.size][2])
 
 
+def log_ticks(axis: Axis, locator: Locator, words: Callable[[float], str]) -> None:
+    """Ticks of a logarithmic axis and what stands at them; no smaller ones."""
+    from matplotlib.ticker import FuncFormatter, NullLocator
+
+    axis.set_major_locator(locator)
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: words(value)))
+
+
 def log_axis(ax: Axes, low: float, high: float) -> None:
     """A logarithmic y axis with powers of ten written out."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import LogLocator
 
     ax.set_yscale("log")
     ax.set_ylim(low, high)
-    ax.yaxis.set_major_locator(LogLocator(10, numticks=7))
-    ax.yaxis.set_minor_locator(NullLocator())
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    log_ticks(ax.yaxis, LogLocator(10, numticks=7), power_of_ten)
 
 
 def log_time(ax: Axes, first_s: float, last_s: float) -> None:
     """A logarithmic time axis from `first_s` to `last_s`."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import LogLocator
 
     ax.set_xscale("log")
     ax.set_xlim(first_s, max(last_s, 2 * first_s))
-    ax.xaxis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    log_ticks(ax.xaxis, LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12), "{:g}".format)
+
+
+def legend(ax: Axes, **how: Any) -> None:
+    """Names of the lines, without a frame; more as matplotlib's."""
+    ax.legend(**{"frameon": False, "labelcolor": MUTED, "fontsize": SIZES["third"][2], **how})
 
 
 def categories(ax: Axes, names: Sequence[str]) -> None:
@@ -195,10 +207,11 @@ def power_of_ten(value: float) -> str:
     return "10" + str(round(float(np.log10(value)))).translate(SUPERSCRIPTS)
 
 
-def mark(ax: Axes, x: float, text: str, top: float = 0.98) -> None:
-    """A vertical line in time with words at its top, or lower (as a share of the height)."""
+def mark(ax: Axes, x: float | None, text: str, top: float = 0.98) -> None:
+    """A vertical line in time with words at its top, or lower (as a share of the height); none
+    where the time is unknown or not shown."""
     low, high = ax.get_xlim()
-    if not low <= x <= high:
+    if x is None or not low <= x <= high:
         return
     ax.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
     share = ax.transAxes.inverted().transform(ax.transData.transform((x, ax.get_ylim()[1])))[0]

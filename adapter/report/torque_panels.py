@@ -36,15 +36,7 @@ SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the pane
 FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
 GROUPS = (("kg", (0,)), ("kg m", (1, 2, 3)), ("kg m²", (4, 7, 9, 5, 6, 8)))  # of ten parameters
 COLOR_OF = (7, 0, 1, 2, 0, 3, 4, 1, 5, 2)  # of each parameter, as of a joint of that number
-BODY_PARTS = (
-    (8, "m"),
-    (1, "mX, XX"),
-    (2, "mY, YY"),
-    (3, "mZ, ZZ"),
-    (4, "XY"),
-    (5, "XZ"),
-    (6, "YZ"),
-)
+BODY_PARTS = ((8, "m"), *enumerate(("mX, XX", "mY, YY", "mZ, ZZ", "XY", "XZ", "YZ"), start=1))
 MOST_ROWS = 160  # along a line of a small panel
 
 
@@ -153,9 +145,7 @@ def _against_batch(data: RunData) -> Panel:
         usual = float(np.median(ours[t >= 0.5 * (t[0] + t[-1])]))
         ax.set_ylim(0.0, max(SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()), 1.5 * usual))
     _finish(drawing, t, data)
-    converged = data.converged_s("theta")
-    if converged is not None:
-        mark(ax, converged, f"inside {TORQUE_GOAL:g} × batch", top=0.88)
+    mark(ax, data.converged_s("theta"), f"inside {TORQUE_GOAL:g} × batch", top=0.88)
     return drawing.panel(
         "Prequential torque error",
         "in units of the noise",

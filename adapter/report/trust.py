@@ -69,8 +69,7 @@ def _unseen(data: RunData, worth: Worth) -> Check | None:
     )
     if fall.worse:
         return Check(BAD, "On data not learned from", f"{said}; worse than the documentation")
-    held = bool(data.figures["theta"].get("validation_torque_rmse_nm"))
-    if not held:
+    if not data.figures["theta"].get("validation_torque_rmse_nm"):
         said += "; no recording was held out"
     return Check(GOOD if ratio.max() < 1.5 else LOOK, "On data not learned from", said)
 

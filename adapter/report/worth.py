@@ -149,16 +149,12 @@ def hand_off_m(data: RunData) -> float | None:
     return float(np.sqrt(np.mean(np.square(apart)))) if apart else None
 
 
-def loads(data: RunData) -> list[tuple[float, float, float | None]]:
-    """(when, s after the first motion, kg, its standard deviation) of the loads that were found."""
-    changes = [change.get("payload") for change in data.figures["theta"].get("changes") or []]
-    pairs = zip(change_times(data), changes, strict=True)
-    return [(at_s, load["m"], load.get("m_std")) for at_s, load in pairs if load]
-
-
 @dataclass(frozen=True)
 class Worth:
-    """What a run brought: errors before and after, how far off the hand stood, the loads found."""
+    """What a run brought: errors before and after, how far off the hand stood, the loads found.
+
+    `loads`: (when, s after the first motion, kg, its standard deviation).
+    """
 
     torque: Fall | None
     tracking: Fall | None
@@ -170,7 +166,10 @@ class Worth:
         """Of a run."""
         measured = data.figures["lambda"].get("source") == LAMBDA_MEASURED
         hand_m = hand_off_m(data) if measured else None
-        return cls(torque_fall(data), tracking_fall(data.figures), hand_m, loads(data))
+        changes = [change.get("payload") for change in data.figures["theta"].get("changes") or []]
+        pairs = zip(change_times(data), changes, strict=True)
+        loads = [(at_s, load["m"], load.get("m_std")) for at_s, load in pairs if load]
+        return cls(torque_fall(data), tracking_fall(data.figures), hand_m, loads)
 
 
 def worth_table(data: RunData, worth: Worth) -> Table | None:

@@ -179,15 +179,16 @@ class Effects:
         self._switches = np.array(sorted(ends))
         self._stages: dict[int, _Stage] = {}
         self._bristles = Bristles(self._active, n, period_s)
-        self._slow = [
-            replace(a, joint=j)
-            for a in self._active
-            if _low_pass(a)
-            for j in (range(n) if a.joint < 0 else (a.joint,))
-        ]
+        self._slow: list[tuple[Active, float, float]] = []  # of one joint, and their low-pass
         kinds = TorqueEffect, BodyEffect
+        told = {a.effect.name for a in self._active if isinstance(a.effect, kinds)}
+        for a in self._active:
+            filtered = a.effect.low_pass(a.values) if isinstance(a.effect, SensorEffect) else None
+            if filtered:
+                told.add(a.effect.name)
+                joints = range(n) if a.joint < 0 else (a.joint,)
+                self._slow += [(replace(a, joint=j), *filtered) for j in joints]
         silent = by_joint(self._active, n).left_out
-        told = {a.effect.name for a in self._active if isinstance(a.effect, kinds) or _low_pass(a)}
         self.left_out = tuple(name for name in silent if name not in told)
         self.reset()
 
@@ -222,13 +223,7 @@ class Effects:
         return self.at_middle(q, dq, ddq, tau, t, 0.0)
 
     def at_middle(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array | None,
-        tau: Array,
-        t: float | None,
-        part: float = 0.5,
+        self, q: Array, dq: Array, ddq: Array | None, tau: Array, t: float | None, part: float = 0.5
     ) -> Array:
         """The same, and what makes the simulator's step one of second order.
 
@@ -307,8 +302,7 @@ class Effects:
         if all(stage.reads_true for stage in stages) and not self._slow:
             return read
         read = read.copy()
-        for active in self._slow:  # torques of which the sensors' low-passes leave these
-            a, b = _low_pass(active) or (0.0, 0.0)
+        for active, a, b in self._slow:  # torques of which the sensors' low-passes leave these
             rate = np.gradient(read[:, active.joint], t)
             more = a * rate + b * np.gradient(rate, t)
             on = active.on(t)
@@ -372,8 +366,7 @@ class Effects:
             each = zip(late, rows.T, strict=True)
             tau = np.array([np.interp(now - d, times, x) for d, x in each])
         tau, clock = tau.copy(), self._clock(t)
-        for k, active in enumerate(self._slow):  # by the implicit Euler method
-            a, b = _low_pass(active) or (0.0, 0.0)
+        for k, (active, a, b) in enumerate(self._slow):  # by the implicit Euler method
             before, last = self._read.get(k, (tau[active.joint],) * 2)
             a, b = a / self.period_s, b / self.period_s**2
             new = (tau[active.joint] + a * last + b * (2.0 * last - before)) / (1.0 + a + b)
@@ -388,12 +381,6 @@ class Effects:
         if t is not None:
             return float(t)
         return self._past[0][0] + self.period_s if self._past else 0.0
-
-
-def _low_pass(active: Active) -> tuple[float, float] | None:
-    return (
-        active.effect.low_pass(active.values) if isinstance(active.effect, SensorEffect) else None
-    )
 
 
 def _dynamics(arm: RigidArm, q: Array, dq: Array) -> tuple[Array, Array]:

@@ -43,10 +43,7 @@ class MujocoArm(SimulatedArm):
     """
 
     def __init__(
-        self,
-        model: SelfModel,
-        simulated: tuple[Any, Any] | None = None,
-        period_s: float = 1e-3,
+        self, model: SelfModel, simulated: tuple[Any, Any] | None = None, period_s: float = 1e-3
     ) -> None:
         self._mujoco = library()
         if simulated is None:

@@ -36,10 +36,7 @@ class PybulletArm(SimulatedArm):
     """
 
     def __init__(
-        self,
-        model: SelfModel,
-        simulated: tuple[int, int] | None = None,
-        period_s: float = 1e-3,
+        self, model: SelfModel, simulated: tuple[int, int] | None = None, period_s: float = 1e-3
     ) -> None:
         pybullet = optional.load("pybullet")
         super().__init__(Effects(model, period_s, "bodies"))
@@ -107,10 +104,7 @@ def _alone(model: SelfModel, period_s: float) -> tuple[int, int]:
             physicsClientId=client,
         )
     pybullet.changeDynamics(
-        body,
-        -1,
-        activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-        physicsClientId=client,
+        body, -1, activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
     )
     pybullet.setGravity(*model.gravity.tolist(), physicsClientId=client)
     pybullet.setTimeStep(period_s, physicsClientId=client)

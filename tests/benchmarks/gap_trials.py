@@ -20,9 +20,8 @@ from sim.hidden import Trial, draw, unseal
 from sim.hidden.motion import KINDS
 from sim.hidden.record import pybullet_recording, write
 from tests.helpers.benchmark import in_processes, options
-from tests.helpers.gap_judges import torque_judge
 from tests.helpers.gap_mujoco import mujoco_recording
-from tests.helpers.gap_oracle import detectability
+from tests.helpers.gap_oracle import detectability, torque_judge
 from tests.helpers.gap_scorer import Row, score_trial, summary, table
 from tests.helpers.gap_tools import pinocchio_recording
 

@@ -1,6 +1,6 @@
 """Bad input gets one clear sentence that names the file, the place and the choices."""
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ ROBOT = documented("panda")
 MIDDLE = np.array([0.0, -0.7, 0.0, -2.3, 0.0, 1.6, 0.8])
 LINK = '<link name="{}"><inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" {}'
 INERTIA = 'iyz="0" izz="1"/></inertial></link>'
+HOLE = np.where(np.arange(7) == 3, np.nan, 0.0)
 
 
 def motion(count: int = 400) -> list[JointSample]:
@@ -34,8 +35,13 @@ def motion(count: int = 400) -> list[JointSample]:
     return [JointSample(1_000_000 * k, q[k], dq[k], tau[k]) for k in range(count)]
 
 
-def record(path: Path, samples: list[JointSample], names=ROBOT.tree.joint_names) -> Path:
-    with McapWriter(path, names) as writer:
+def resting(count: int) -> list[JointSample]:
+    still = motion(1)[0]
+    return [replace(still, stamp_ns=1_000_000 * k) for k in range(count)]
+
+
+def record(path: Path, samples: list[JointSample]) -> Path:
+    with McapWriter(path, ROBOT.tree.joint_names) as writer:
         for sample in samples:
             writer.write(sample)
     return path
@@ -115,18 +121,14 @@ def test_joints_that_an_arm_without_names_lacks_are_locked(
 
 
 def test_a_log_that_repeats_one_reading(tmp_path, capsys) -> None:
-    still = motion(1)[0]
-    samples = [JointSample(1_000_000 * k, still.q, still.dq, still.tau) for k in range(300)]
-    path = record(tmp_path / "log.mcap", samples)
+    path = record(tmp_path / "log.mcap", resting(300))
     said = replayed(tmp_path, capsys, path, ExitCode.NOTHING_LEARNED)
     assert "299 repeated" in said and "learned 0" in said
 
 
 @pytest.mark.parametrize("count", [3, 3000])
 def test_a_load_needs_more_than_one_reading(tmp_path, refused, count: int) -> None:
-    still = motion(1)[0]
-    samples = [JointSample(1_000_000 * k, still.q, still.dq, still.tau) for k in range(count)]
-    said = refused("load", record(tmp_path / "log.mcap", samples))
+    said = refused("load", record(tmp_path / "log.mcap", resting(count)))
     assert "log.mcap: only" in said and "record at least 1.5 s" in said
 
 
@@ -164,7 +166,7 @@ def test_models_of_different_joints_are_not_compared(tmp_path, refused) -> None:
 def test_times_count_from_the_recordings_start(tmp_path, capsys) -> None:
     """Not from the year 1970, from which robots and ROS count."""
     began = 1_700_000_000_000_000_000
-    samples = [dataclasses.replace(s, stamp_ns=began + s.stamp_ns) for s in motion(2200)]
+    samples = [replace(s, stamp_ns=began + s.stamp_ns) for s in motion(2200)]
     del samples[1000:1300]
     samples[1700].q[3] = np.nan
     path = record(tmp_path / "log.mcap", samples)
@@ -176,35 +178,20 @@ def test_times_count_from_the_recordings_start(tmp_path, capsys) -> None:
     assert "17000000" not in said and "1.7e+09" not in said
 
 
-def _in_degrees(samples: list[JointSample]) -> None:
-    samples[:] = [JointSample(s.stamp_ns, 57.3 * s.q, 57.3 * s.dq, s.tau) for s in samples]
-
-
-def _without_a_number(samples: list[JointSample]) -> None:
-    samples[100].q[3] = np.nan
-
-
-def _backwards(samples: list[JointSample]) -> None:
-    samples[200] = dataclasses.replace(samples[200], stamp_ns=samples[190].stamp_ns)
-
-
-def _with_a_gap(samples: list[JointSample]) -> None:
-    del samples[200:250]
-
-
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoilt", "said"),
     [
-        (_in_degrees, "degrees"),
-        (_without_a_number, "1 non finite"),
-        (_backwards, "1 time backwards"),
-        (_with_a_gap, "0.051 s without a sample"),
+        (lambda x: [replace(s, q=57.3 * s.q, dq=57.3 * s.dq) for s in x], "degrees"),
+        (lambda x: [*x[:100], replace(x[100], q=x[100].q + HOLE), *x[101:]], "1 non finite"),
+        (
+            lambda x: [*x[:200], replace(x[200], stamp_ns=x[190].stamp_ns), *x[201:]],
+            "1 time backwards",
+        ),
+        (lambda x: x[:200] + x[250:], "0.051 s without a sample"),
     ],
 )
-def test_a_recording_with_a_fault_says_which(tmp_path, capsys, spoil, said: str) -> None:
-    samples = motion()
-    spoil(samples)
-    path = record(tmp_path / "log.mcap", samples)
+def test_a_recording_with_a_fault_says_which(tmp_path, capsys, spoilt, said: str) -> None:
+    path = record(tmp_path / "log.mcap", spoilt(motion()))
     assert said in replayed(tmp_path, capsys, path, *LEARNED, ExitCode.NOTHING_LEARNED)
 
 

@@ -29,6 +29,8 @@ from tests.helpers.discovery_data import (
     robot,
 )
 
+NO_TURNING = (1, 1, 1, 0, 0, 0)
+
 
 @cache
 def _case(name: str, motion: Motion, seed: int, noise: float = 1.0) -> Case:
@@ -74,18 +76,9 @@ def test_resting_joints_are_named_and_not_guessed(still: tuple[int, ...]) -> Non
     case = _case("panda", replace(SHORT, still=still), 5)
     found = discover(case.log)
     assert _worst_wrong(case, found) < TRUSTED
-    joints = [next(j for j, link, _ in case.edges if _is_link(case, link, s)) for s in still]
-    for joint in joints:
+    resting = _chain(case)[list(still)]
+    for joint in (joint for joint, link, _ in case.edges if link in resting):
         assert any(joint in line and "does not move" in line for line in found.undecided)
-
-
-def _is_link(case: Case, link: str, joint: int) -> bool:
-    """Whether a recorded link name is that of the link that a joint of the robot moves."""
-    children = {parent: (j, link) for j, link, parent in case.edges}
-    at = case.root
-    for _ in range(joint + 1):
-        at = children[at][1]
-    return at == link
 
 
 def test_joints_that_move_alike_tie() -> None:
@@ -99,8 +92,7 @@ def test_joints_that_move_alike_tie() -> None:
 
 def test_a_missing_link_leaves_its_child_open() -> None:
     case = _case("panda", SHORT, 0)
-    gone = next(link for _, link, _ in case.edges if _is_link(case, link, 3))
-    keep = [k for k, name in enumerate(case.log.link_names) if name != gone]
+    keep = [k for k, name in enumerate(case.log.link_names) if name != _chain(case)[3]]
     names = tuple(case.log.link_names[k] for k in keep)
     motion = {part: getattr(case.log, part)[:, keep] for part in ("twists", "accels")}
     found = discover(replace(case.log, link_names=names, **motion))
@@ -214,7 +206,7 @@ def test_command_writes_tree_and_model(tmp_path: Path) -> None:
     [
         (lambda log: {"twists": None, "accels": None, "link_names": ()}, "has no motion of links"),
         (lambda log: {"twists": np.nan * log.twists, "accels": None}, "it has: nothing"),
-        (lambda log: {"twists": None, "accels": _no_turning(log.accels)}, "neither angular"),
+        (lambda log: {"twists": None, "accels": log.accels * NO_TURNING}, "neither angular"),
         (lambda log: {"stamp_ns": log.stamp_ns // 1000}, "lasts 0.00 s"),
         (lambda log: {"q": np.full_like(log.q, np.nan)}, "at the same time"),
         (lambda log: {"twists": _one_link_silent(log.twists)}, "at the same time.* 1 %"),
@@ -225,12 +217,6 @@ def test_what_cannot_serve_is_told(change, sentence: str) -> None:  # type: igno
     log = _case("panda", SHORT, 0).log
     with pytest.raises((SettingsError, ModelError), match=sentence):
         discover(replace(log, **change(log)))
-
-
-def _no_turning(accels: np.ndarray) -> np.ndarray:
-    out = accels.copy()
-    out[..., 3:] = 0.0
-    return out
 
 
 def _one_link_silent(twists: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from adapter.errors import ModelError
-from adapter.experiments.baselines.compare import ValidationPart, compare, select
+from adapter.experiments.baselines.compare import compare, select, validation_part
 from adapter.experiments.baselines.elm import ElmCommittee
 from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
 from adapter.experiments.baselines.gaussian_process import GaussianProcess, negative_log_likelihood
@@ -20,7 +20,7 @@ from adapter.experiments.baselines.lagrangian import DeepLagrangian, MassNetwork
 from adapter.experiments.baselines.learner import Baseline, Scale
 from adapter.experiments.baselines.least_squares import RegressorLeastSquares
 from adapter.experiments.baselines.network import FeedForward
-from adapter.experiments.baselines.presets import DEFAULT_MEMBERS, Choice, learners
+from adapter.experiments.baselines.presets import Choice, learners
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
@@ -268,7 +268,7 @@ def test_the_experiments_learners_have_the_papers_sizes() -> None:
     """Full: as in section IV; else the committee is smaller; GPR has its 10 000 points in both."""
     index = sub_chain(TREE, ARM, CARRIER)
     schema = Columns(3), sub_parents(TREE, index), robot(0)[0][index]
-    for full, members in ((True, 50), (False, DEFAULT_MEMBERS)):
+    for full, members in ((True, 50), (False, 20)):
         found = {choice.key: choice.make() for choice in learners(*schema, full=full)}
         assert list(found) == ["FFNN", "ELM", "GPR", "DeLaN", "WLS"]
         elm, gpr, net = found["ELM"], found["GPR"], found["FFNN"]
@@ -296,24 +296,24 @@ def test_settings_are_chosen_on_samples_that_no_trial_saw() -> None:
     trajectory = np.repeat(np.arange(10), 40)
     x = np.column_stack([trajectory, np.arange(400.0)])
     y = np.full((400, 2), 5.0)
-    part = ValidationPart.of((x, y), seed=3)
-    fit, judge = set(part.fit[0][:, 1]), set(part.judge[0][:, 1])
+    parted = validation_part((x, y), seed=3)
+    fit, judge = (set(part[0][:, 1]) for part in parted)
     assert len(fit) == 300 and len(judge) == 100 and not fit & judge
-    assert set(part.judge[0][:, 0]) == set(range(10))
-    same, other = (ValidationPart.of((x, y), seed).judge[0] for seed in (3, 4))
-    assert np.array_equal(same, part.judge[0]) and not np.array_equal(other, part.judge[0])
+    assert set(parted[1][0][:, 0]) == set(range(10))
+    same, other = (validation_part((x, y), seed)[1][0] for seed in (3, 4))
+    assert np.array_equal(same, parted[1][0]) and not np.array_equal(other, parted[1][0])
 
     fitted: list[np.ndarray] = []
     errors = (2.0, -0.5, 3.0)
     choice = Choice("X", "X", partial(Echo, fitted=fitted), tuple({"error": e} for e in errors))
-    found = select(choice, part, lambda said: None)
+    found = select(choice, *parted, lambda said: None)
     assert found["chosen"] == {"error": -0.5}
     told = [row["validation_median"] for row in found["candidates"]]
     assert told == pytest.approx([2 / 7, 0.1, 3 / 8])
     for table in fitted:
         assert set(table[:, 1]) == fit
     alone = Choice("Y", "Y", partial(Echo, fitted=fitted))
-    assert select(alone, part, lambda said: None) == {"chosen": {}, "candidates": []}
+    assert select(alone, *parted, lambda said: None) == {"chosen": {}, "candidates": []}
 
 
 def test_the_test_and_the_control_set_have_no_say_in_the_settings() -> None:

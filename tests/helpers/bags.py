@@ -119,9 +119,9 @@ def write_ros1(path, topics, names=JOINTS, compression=None):
     return path
 
 
-def write_ros2(path, topics, names=JOINTS, storage=None, compression=None, version=9):
+def write_ros2(path, topics, names=JOINTS, storage=None, compression=None):
     """A folder of rosbag2; topics as above; storage and compression of rosbags' writer."""
-    writer = Ros2Writer(path, version=version, **({"storage_plugin": storage} if storage else {}))
+    writer = Ros2Writer(path, version=9, **({"storage_plugin": storage} if storage else {}))
     if compression:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:

@@ -62,6 +62,14 @@ def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
     return links.ids
 
 
+def ids_of_a_whole_page(page: str, sections: str) -> list[str]:
+    """Assert that a page stands alone, is small, has these sections and no empty value; its ids."""
+    assert re.findall(r'<(?:section|footer) id="(\w+)"', page) == sections.split()
+    assert page.startswith("<!doctype html>") and len(page.encode()) < 2_000_000
+    assert not re.search(r"\b(None|nan|null|inf|Undefined)\b", text_of(page))
+    return ids_of_a_page_that_fetches_nothing(page)
+
+
 def text_of(page: str) -> str:
     """What a reader sees, with plain spaces."""
     text = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.S)

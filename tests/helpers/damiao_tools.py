@@ -136,9 +136,8 @@ class MotorBus(can.BusABC):
     measured one frame before its reply's arrival.
     """
 
-    def __init__(self, bank, clock=None, spread_ns=SLOT_NS):
-        self.bank, self.clock = bank, clock or Time()
-        self.spread_ns = spread_ns
+    def __init__(self, bank):
+        self.bank, self.clock, self.spread_ns = bank, Time(), SLOT_NS
         self._queue, self._count = [], 0
         self.sent, self.refusing, self.keep = [], 0, lambda can_id, data: True
         self.channel_info = "motors"

@@ -93,11 +93,11 @@ def _run(
     return FaultRun(text, driver, front_end, learner, result, watched.finite, watched.history)
 
 
-def run_faulty(text: str, seconds: float, seed: int = SEED) -> FaultRun:
+def run_faulty(text: str, seconds: float) -> FaultRun:
     """The simulated Panda in motion, behind these faults, for so long on its own stamps."""
     limits = MotionLimits.of(panda_model())
-    controller = ExcitationController(limits, ExcitationSettings(seed=seed))
-    return _run(simulated_arm(seed), text, controller, seconds)
+    controller = ExcitationController(limits, ExcitationSettings(seed=SEED))
+    return _run(simulated_arm(SEED), text, controller, seconds)
 
 
 @cache

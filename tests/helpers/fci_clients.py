@@ -45,13 +45,7 @@ def demand(protocol: int) -> None:
 
 
 @contextlib.contextmanager
-def robot(
-    protocol: int,
-    *faults: str,
-    seed: int = 3,
-    patience_s: float = PATIENCE_S,
-    more: tuple[str, ...] = (),
-):
+def robot(protocol: int, *faults: str, patience_s: float = PATIENCE_S, more: tuple[str, ...] = ()):
     """A simulated robot on the port that the clients know, with more of its options; one at a time
     on a machine.
 
@@ -62,8 +56,7 @@ def robot(
         options = [word for fault in faults for word in ("--fault", fault)]
         command = [
             sys.executable, "-m", "adapter", "sim", "fci", "--protocol", str(protocol),
-            "--seed", str(seed),
-            "--json", str(summary), "--patience", str(patience_s), *options, *more,
+            "--seed", "3", "--json", str(summary), "--patience", str(patience_s), *options, *more,
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])
         try:
@@ -130,18 +123,22 @@ class Watch:
             self.late = self.late or now_ms > before_ms + 1 or self._last[1] - before_s > LATE_S
 
 
-class Panda:
-    """panda-python's Robot."""
+class Connected:
+    """A connection by one of the vendor's libraries, which are much alike."""
 
-    def __init__(self) -> None:
-        self.watch = Watch()
-        import panda_py
-
-        self.lib = panda_py.libfranka
-        self.robot = self.lib.Robot("127.0.0.1", self.lib.RealtimeConfig.kIgnore)
+    def __init__(self, lib) -> None:
+        self.watch, self.lib = Watch(), lib
+        self.robot = lib.Robot("127.0.0.1", lib.RealtimeConfig.kIgnore)
 
     def state(self):
         return self.robot.read_once()
+
+
+class Panda(Connected):
+    """panda-python's Robot."""
+
+    def __init__(self) -> None:
+        super().__init__(importlib.import_module("panda_py").libfranka)
 
     def millisecond(self, state) -> int:
         return state.time.to_msec()
@@ -185,18 +182,11 @@ class Panda:
         self.robot.control_joint_position(control, mode, False, 1000.0)
 
 
-class FR3:
+class FR3(Connected):
     """pylibfranka's Robot."""
 
     def __init__(self) -> None:
-        self.watch = Watch()
-        import pylibfranka
-
-        self.lib = pylibfranka
-        self.robot = self.lib.Robot("127.0.0.1", self.lib.RealtimeConfig.kIgnore)
-
-    def state(self):
-        return self.robot.read_once()
+        super().__init__(importlib.import_module("pylibfranka"))
 
     def millisecond(self, state) -> int:
         return round(1000 * state.time.to_sec())

@@ -10,20 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import fftconvolve, firwin
 
+from adapter.model.model_file import load_model
 from drivers.files.mcap import Log
-from sim.effects import Effect
+from sim.effects import Effect, effect_from
 from sim.hidden import Trial
 from sim.hidden.motion import draw_motion
 from sim.truth import Truth
 from tests.helpers.arm_data import rms
 from tests.helpers.gap_effects import Array, predict, regressor, rnea, sense, slope
-from tests.helpers.gap_tools import sensor_noise
+from tests.helpers.gap_scorer import Row
+from tests.helpers.gap_tools import pinocchio_recording, sensor_noise
 
 TAPS, EDGE, STEP = 1001, 500, 40  # at 1 kHz: transition of 3 Hz; half a filter; to 25 Hz
 LOWPASS = firwin(TAPS, 10.0, fs=1000.0)[:, None]
@@ -279,3 +282,29 @@ def second(trial: Trial) -> Trial:
     rng = np.random.default_rng([trial.seed, HELD_STREAM])
     motion = draw_motion(rng, trial.nominal.limits, trial.nominal.ready)
     return replace(trial, motion=motion, seed=trial.seed + SECOND)
+
+
+def torque_judge(trial: Trial, recording: Log, result: dict[str, Any], folder: Path) -> Row:
+    """Torque RMSE at 25 Hz of the model that was written, against that of the oracle's fit.
+
+    Both are fitted to `recording` and judged on a second recording of the same arm. The effects
+    are those of the findings, computed by the tests' formulas; of the model file only θ is used.
+
+    Returns:
+        `torque_ratio`: rms over the joints of the ratios; `torque_rmse_nm`, `oracle_rmse_nm`.
+    """
+    if not result.get("model_out"):
+        return {}
+    place = Path(result["model_out"])
+    theta = load_model(place if place.is_absolute() else folder / place).theta
+    other = second(trial)
+    unseen = Oracle(other, pinocchio_recording(other))
+    fit = Oracle(trial, recording).fit()
+    best = rms(unseen.residual(fit.effects, fit.theta, True))
+    found = tuple(effect_from(finding) for finding in result["findings"])
+    ours = rms(unseen.residual(found, theta, False))
+    return {
+        "torque_ratio": float(np.sqrt(np.mean(np.square(ours / best)))),
+        "torque_rmse_nm": ours.tolist(),
+        "oracle_rmse_nm": best.tolist(),
+    }

@@ -91,11 +91,9 @@ def pinocchio_recording(trial: Trial) -> Log:
     return recorded(trial, q, dq, tau + trial.disturbance(), None)
 
 
-def pinocchio_trial(
-    seed: int, kind: str | None = None, effect: str | None = None
-) -> tuple[Log, str, dict[str, Any]]:
+def pinocchio_trial(seed: int, kind: str) -> tuple[Log, str, dict[str, Any]]:
     """Recording, nominal URDF and truth of a seed; see `sim.hidden.draw`."""
-    trial = draw(seed, kind, effect)
+    trial = draw(seed, kind)
     truth = {**trial.as_dict(), "simulator": "pinocchio"}
     return pinocchio_recording(trial), nominal_urdf(trial.nominal), truth
 

@@ -38,8 +38,8 @@ from tests.helpers.live_learners import (  # noqa: F401  # these are the tests' 
 PANDA = documented("panda")
 
 
-def simulated_arm(seed: int = 5, scenario: str = "nominal") -> PyBulletArm:
-    return PyBulletArm(build(scenario, seed).plant())
+def simulated_arm(seed: int = 5) -> PyBulletArm:
+    return PyBulletArm(build("nominal", seed).plant())
 
 
 def parts(seed: int = 5):
@@ -48,9 +48,9 @@ def parts(seed: int = 5):
     return FrontEnd(PANDA), ExcitationController(MotionLimits.of(PANDA), motion)
 
 
-def swinging_parts(seed: int = 5):
+def swinging_parts():
     """The same of an arm that swings by itself: held softly near where it is, it is no trouble."""
-    motion = ExcitationSettings(seed=seed, range_share=0.05)
+    motion = ExcitationSettings(seed=5, range_share=0.05)
     soft = ControlSettings(stiffness=[20.0] * 7)
     return FrontEnd(PANDA), ExcitationController(MotionLimits.of(PANDA), motion, soft)
 

@@ -237,11 +237,11 @@ def position_arm(seed: int, drawn: Drawn | None = None) -> PositionArm:
     return PositionArm(truth.with_changes(theta=truth.theta * factor), servos, drawn)
 
 
-def as_log(recording: PositionRecording, name: str = "arm.mcap") -> Log:
+def as_log(recording: PositionRecording) -> Log:
     """In memory."""
     r, none = recording, np.full_like(recording.q, np.nan)
     orders = Commands(r.stamp_ns, np.full_like(r.q_command, np.nan), r.q_command)
-    return Log(Path(name), r.joint_names, r.stamp_ns, r.q, none, none, commands=orders)
+    return Log(Path("arm.mcap"), r.joint_names, r.stamp_ns, r.q, none, none, commands=orders)
 
 
 def named(gap: ServoGap) -> set[tuple[str, int]]:

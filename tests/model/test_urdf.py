@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.effects.export import to_urdf
+from adapter.effects.export import robot_urdf, to_urdf
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented, names
@@ -131,15 +132,16 @@ def test_a_tool_is_kept_apart_and_counts_in_the_torques() -> None:
     np.testing.assert_allclose(merged.theta, model.theta_with_tool(), atol=1e-12)
 
 
-def test_an_impossible_body_is_not_exported() -> None:
+@pytest.mark.parametrize("write", [to_urdf, robot_urdf])
+def test_an_impossible_body_is_not_exported(write: Callable[[SelfModel], object]) -> None:
     model = documented("panda")
     theta = model.theta.copy()
     theta[3, 4] = 1.0  # XX far above YY + ZZ
     with pytest.raises(ModelError, match=r"'panda_link4'.*impossible.*eigenvalue of -0\."):
-        to_urdf(replace(model, theta=theta))
+        write(replace(model, theta=theta))
     theta[3] = 0.0
     with pytest.raises(ModelError, match=r"'panda_link4'.*eigenvalue of 0"):
-        to_urdf(replace(model, theta=theta))
+        write(replace(model, theta=theta))
 
 
 def test_with_base_is_there_and_back() -> None:

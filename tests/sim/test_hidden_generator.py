@@ -20,8 +20,7 @@ from sim.hidden.trial import FRICTION_SHARE, MODEL_ERROR, RUBS
 from tests.benchmarks.gap_trials import run_trial
 from tests.helpers import gap_mujoco
 from tests.helpers.gap_effects import predict, sense, slope
-from tests.helpers.gap_judges import torque_judge
-from tests.helpers.gap_oracle import Oracle, detectability, rms, second, slow
+from tests.helpers.gap_oracle import Oracle, detectability, rms, second, slow, torque_judge
 from tests.helpers.gap_scorer import score_trial, summary, table, wilson
 from tests.helpers.gap_tools import pinocchio_recording, pinocchio_trial, with_sines, write_trial
 

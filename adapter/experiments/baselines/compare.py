@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
-from adapter.experiments.baselines.presets import Choice, learners
+from adapter.experiments.baselines.features import arm_problem
+from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.falls import Falls, sets_of
 from adapter.experiments.results import BOX_PERCENTILES, LearnerScores
 from adapter.experiments.split import SETS, TRAIN_SHARE, Split
 from adapter.learning.batch.prediction_errors import relative_errors
 from adapter.model.spatial import Array
-from adapter.model.tree import Tree
 
 Say = Callable[[str], None]
 Table = tuple[Array, Array]  # inputs X and torques Y
@@ -41,14 +39,6 @@ def arm_tables(
     return sets
 
 
-def choices(
-    tree: Tree, lam: Array, joints: Sequence[str], carrier: str, full: bool, seed: int
-) -> tuple[Choice, ...]:
-    """The learners; the body schema λ (n, 6) is for least squares alone."""
-    index = sub_chain(tree, joints, carrier)
-    return learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed)
-
-
 def compare(
     sets: dict[str, Table], chosen: Sequence[Choice], seed: int, say: Say
 ) -> list[LearnerScores]:
@@ -56,7 +46,7 @@ def compare(
 
     Args:
         sets: of `arm_tables`.
-        chosen: of `choices`.
+        chosen: of `presets.learners`.
         seed: of the samples that are judged, and of the validation part.
         say: takes a sentence on progress.
     """
@@ -64,10 +54,10 @@ def compare(
     for name, (x, y) in sets.items():
         rows = np.random.default_rng(seed).permutation(len(x))[:JUDGED]
         judged[name] = x[rows], y[rows]
-    validation = ValidationPart.of(sets["train"], seed)
+    parted = validation_part(sets["train"], seed)
     found = []
     for choice in chosen:
-        selection = select(choice, validation, say)
+        selection = select(choice, *parted, say)
         say(f"training: {choice.title}")
         learner = choice.make(**selection["chosen"])
         learner.fit(*sets["train"], progress=say)
@@ -86,33 +76,24 @@ def compare(
 # --- settings, chosen on a part of the training set that no trial learns from -------------------
 
 
-@dataclass(frozen=True)
-class ValidationPart:
-    """The training set parted once more: to learn from, and to judge settings by.
+def validation_part(train: Table, seed: int) -> tuple[Table, Table]:
+    """The training set parted once more: X and Y to learn from, and others to judge settings by.
 
     Drawn as the test set is drawn from all samples, shuffled and in the same share, so that it
-    asks of a learner what the test set will ask.
-
-    Attributes:
-        fit: X and Y of the samples that trials learn from.
-        judge: X and Y of the samples that trials are judged by; none of those in `fit`.
+    asks of a learner what the test set will ask. Those two sets are not even handed over.
     """
-
-    fit: Table
-    judge: Table
-
-    @classmethod
-    def of(cls, train: Table, seed: int) -> ValidationPart:
-        """Of the training set alone: the test and the control set are not even handed over."""
-        x, y = train
-        order = np.random.default_rng([seed, 1]).permutation(len(x))
-        cut = round(TRAIN_SHARE * len(x))
-        fit, judge = order[:cut], order[cut:][:JUDGED]
-        return cls((x[fit], y[fit]), (x[judge], y[judge]))
+    x, y = train
+    order = np.random.default_rng([seed, 1]).permutation(len(x))
+    cut = round(TRAIN_SHARE * len(x))
+    fit, judge = order[:cut], order[cut:][:JUDGED]
+    return (x[fit], y[fit]), (x[judge], y[judge])
 
 
-def select(choice: Choice, part: ValidationPart, say: Say) -> dict[str, Any]:
+def select(choice: Choice, fit: Table, judge: Table, say: Say) -> dict[str, Any]:
     """The candidate with the smallest median error by eq. 20 on the validation part, all joints.
+
+    Args:
+        fit, judge: samples that trials learn from, and are judged by.
 
     Returns:
         chosen (settings), candidates (settings and validation_median of each; none where there
@@ -124,17 +105,16 @@ def select(choice: Choice, part: ValidationPart, say: Say) -> dict[str, Any]:
     rows = []
     for candidate in choice.candidates:
         learner = choice.make(**{**(choice.trial or {}), **candidate})
-        learner.fit(*part.fit)
-        x, y = part.judge
-        error = float(np.nanmedian(relative_errors(y, learner.predict(x))))
+        learner.fit(*fit)
+        error = float(np.nanmedian(relative_errors(judge[1], learner.predict(judge[0]))))
         rows.append({**candidate, "validation_median": error})
     errors = [row["validation_median"] for row in rows]
     best = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     return {
         "chosen": dict(choice.candidates[best]),
         "candidates": rows,
-        "validation_samples": len(part.judge[0]),
-        "trial": {"samples": len(part.fit[0]), **(choice.trial or {})},
+        "validation_samples": len(judge[0]),
+        "trial": {"samples": len(fit[0]), **(choice.trial or {})},
     }
 
 

@@ -57,7 +57,14 @@ class ElmCommittee(ScaledBaseline):
             rows = rng.choice(len(x), points, replace=False)
             self._machines.append(self._machine(x[rows], y[rows], rng))
             progress(f"committee: machine {member + 1} of {self.members}")
-        return self._told(points, x.shape[1])
+        inputs = x.shape[1]
+        sizes = {"members": self.members, "units": self.units, "points": points, "inputs": inputs}
+        return sizes, (
+            f"Random input weights with deviation {self.spread:g} / sqrt({inputs}) on standardised "
+            "inputs, biases uniform in -1 to 1.",
+            f"Output weights by ridge regression, ridge {self.ridge:g} on the mean Gram matrix, "
+            "float64 (float32 is not positive definite there).",
+        )
 
     def _machine(self, x: Array, y: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Weights and biases of units tanh(x weights + biases), and the output weights."""
@@ -78,13 +85,3 @@ class ElmCommittee(ScaledBaseline):
         """The mean over the committee."""
         every = sum(np.tanh(x @ w + b) @ output for w, b, output in self._machines)
         return np.asarray(every) / len(self._machines)
-
-    def _told(self, points: int, inputs: int) -> Told:
-        sizes = {"members": self.members, "units": self.units, "points": points, "inputs": inputs}
-        tuning = (
-            f"Random input weights with deviation {self.spread:g} / sqrt({inputs}) on standardised "
-            "inputs, biases uniform in -1 to 1.",
-            f"Output weights by ridge regression, ridge {self.ridge:g} on the mean Gram matrix, "
-            "float64 (float32 is not positive definite there).",
-        )
-        return sizes, tuning

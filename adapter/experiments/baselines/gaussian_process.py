@@ -52,7 +52,15 @@ class GaussianProcess(ScaledBaseline):
         progress(f"Gaussian process: share of noise {noise:.1e}; solving {len(x)} points")
         self._kept = x / self._lengths
         self._alpha, noise = _solved(self._kept, y, noise)
-        return self._told(len(x), noise)
+        tuned_on = min(self.tuned_on, len(x))
+        low, high = self._lengths.min(), self._lengths.max()
+        bound = " (its lower bound)" if noise <= NOISES[0] * (1.0 + 1e-6) else ""
+        return {"points": len(x), "tuned_on": tuned_on, "inputs": len(self._lengths)}, (
+            f"One length scale by input ({low:.2g} to {high:.2g} deviations) and the share of "
+            f"noise {noise:.1e}{bound} by marginal likelihood on {tuned_on} points, L-BFGS from "
+            f"equal lengths, at most {self.steps} steps; one kernel for all joints.",
+            "Exact solution by Cholesky in float64 on all points.",
+        )
 
     def _tuned(self, x: Array, y: Array) -> tuple[Array, float]:
         """Length scales (width,) and share of noise where the marginal likelihood is highest."""
@@ -73,18 +81,6 @@ class GaussianProcess(ScaledBaseline):
         """The mean of the process."""
         mean: Array = kernel(x / self._lengths, self._kept) @ self._alpha
         return mean
-
-    def _told(self, points: int, noise: float) -> Told:
-        tuned_on = min(self.tuned_on, points)
-        low, high = self._lengths.min(), self._lengths.max()
-        bound = " (its lower bound)" if noise <= NOISES[0] * (1.0 + 1e-6) else ""
-        tuning = (
-            f"One length scale by input ({low:.2g} to {high:.2g} deviations) and the share of "
-            f"noise {noise:.1e}{bound} by marginal likelihood on {tuned_on} points, L-BFGS from "
-            f"equal lengths, at most {self.steps} steps; one kernel for all joints.",
-            "Exact solution by Cholesky in float64 on all points.",
-        )
-        return {"points": points, "tuned_on": tuned_on, "inputs": len(self._lengths)}, tuning
 
 
 def kernel(first: Array, second: Array) -> Array:

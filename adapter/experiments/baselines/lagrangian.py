@@ -153,7 +153,13 @@ class DeepLagrangian(Baseline):
             if (step + 1) % max(1, self.steps // 20) == 0:
                 progress(f"Lagrangian network: step {step + 1}, loss {float(loss.detach()):.2e}")
         self._mass = mass.requires_grad_(False)
-        return self._told(len(x))
+        layers = " and ".join(str(units) for units in self.hidden)
+        return {"samples": len(x), "steps": self.steps, "inputs": self.columns.width}, (
+            f"Mass matrix of {BASE_ROWS + self.columns.n} rows from layers of {layers} softplus "
+            "units on cos q and sin q; gravity and the carrier's motion enter by mechanics.",
+            f"ADAM with batches of {self.batch} for {self.steps} steps, rate {self.rate:g} "
+            "falling along half a cosine, float32.",
+        )
 
     def _sizes(self, X: Array, torque: Array) -> Array:
         """Order of the factor's entries (6 + n, 6 + n).
@@ -178,13 +184,3 @@ class DeepLagrangian(Baseline):
         place = self._mass.last.weight.device
         torque = self._torque(self._mass, torch.from_numpy(x).float().to(place))
         return torque.detach().double().cpu().numpy()
-
-    def _told(self, samples: int) -> Told:
-        layers = " and ".join(str(units) for units in self.hidden)
-        tuning = (
-            f"Mass matrix of {BASE_ROWS + self.columns.n} rows from layers of {layers} softplus "
-            "units on cos q and sin q; gravity and the carrier's motion enter by mechanics.",
-            f"ADAM with batches of {self.batch} for {self.steps} steps, rate {self.rate:g} "
-            "falling along half a cosine, float32.",
-        )
-        return {"samples": samples, "steps": self.steps, "inputs": self.columns.width}, tuning

@@ -17,9 +17,6 @@ Progress = Callable[[str], None]
 # Sizes by name, and sentences on the tuning, of a learner that has learned.
 Told = tuple[Mapping[str, float], tuple[str, ...]]
 
-# A column whose deviation is below this share of its size holds a constant and rounding.
-CONSTANT_SHARE = 1e-12
-
 
 @dataclass(frozen=True)
 class Facts:
@@ -50,7 +47,7 @@ class Baseline(ABC):
         """Learn from samples. Raises ModelError for tables that don't fit or aren't finite."""
         begin = time.perf_counter()
         X = checked(X, Y)
-        sizes, tuning = self._learn(X, Y, progress or _unheard)
+        sizes, tuning = self._learn(X, Y, progress or (lambda said: None))
         self._width = X.shape[1]
         named = {name: float(value) for name, value in sizes.items()}
         self._facts = Facts(named, tuning, time.perf_counter() - begin)
@@ -75,10 +72,6 @@ class Baseline(ABC):
     @abstractmethod
     def _answer(self, x: Array) -> Array:
         """Torques (m, n), N m, of at most `at_once` checked samples."""
-
-
-def _unheard(said: str) -> None:
-    """Progress that nobody asked for."""
 
 
 class ScaledBaseline(Baseline):
@@ -115,7 +108,7 @@ class Scale:
     def of(cls, table: Array) -> Scale:
         """Of a table (m, width)."""
         mean, deviation = table.mean(axis=0), table.std(axis=0)
-        flat = deviation <= CONSTANT_SHARE * np.abs(table).max(axis=0)
+        flat = deviation <= 1e-12 * np.abs(table).max(axis=0)  # a constant and rounding
         return cls(mean, np.where(flat, 1.0, deviation))
 
     def __call__(self, table: Array) -> Array:

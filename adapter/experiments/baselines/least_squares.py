@@ -18,9 +18,6 @@ from adapter.model.tree import Tree
 from adapter.physics.identifiability import RANK_TOLERANCE
 from adapter.physics.networks import DTYPE, PER_BODY, regressor
 
-# No joint's torque is taken for better than this share of its size.
-LEAST_SHARE = 1e-12
-
 
 class RegressorLeastSquares(Baseline):
     """Inertial parameters of an arm from its torques, weighted by joint, smallest norm."""
@@ -53,7 +50,8 @@ class RegressorLeastSquares(Baseline):
         size = np.maximum(np.sqrt(np.mean(Y**2, axis=0)), 1e-9)
         theta, rank = _solved(triangles, size)
         rest = [np.linalg.norm(r[:, :-1] @ theta - r[:, -1]) for r in triangles]
-        noise = np.maximum(np.array(rest) / np.sqrt(len(X)), LEAST_SHARE * size)
+        # no joint's torque is taken for better than this share of its size
+        noise = np.maximum(np.array(rest) / np.sqrt(len(X)), 1e-12 * size)
         self._theta, rank = _solved(triangles, noise)
         return {"samples": len(X), "parameters": PER_BODY * self.tree.n, "rank": rank}, (
             "λ is known; θ by weighted least squares (QR), the weights from each joint's rest, "

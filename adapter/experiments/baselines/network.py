@@ -11,7 +11,6 @@ from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
 from adapter.model.spatial import Array
 
 UNITS = 1000  # the paper's
-BATCH = 200  # samples
 # (share of the epochs, share of ADAM's first rate): constant rates leave the loss where their
 # noise is.
 SCHEDULE = ((0.35, 1.0), (0.3, 0.5), (0.2, 0.15), (0.15, 0.05))
@@ -26,7 +25,7 @@ class FeedForward(ScaledBaseline):
         self,
         units: int = UNITS,
         epochs: int = 120,
-        batch: int = BATCH,
+        batch: int = 200,
         rate: float = 2e-3,
         seed: int = 0,
     ) -> None:
@@ -68,18 +67,14 @@ class FeedForward(ScaledBaseline):
                 warnings.simplefilter("ignore")  # that it stopped at the last epoch, as told to
                 self._net.fit(x, y if y.shape[1] > 1 else y[:, 0])
             progress(f"network: {epochs} epochs at rate {rate:g}, loss {self._net.loss_:.2e}")
-        return self._told(len(x), x.shape[1])
-
-    def _answer_scaled(self, x: Array) -> Array:
-        found = self._net.predict(x.astype(np.float32))
-        return np.asarray(found.reshape(len(x), -1), dtype=np.float64)
-
-    def _told(self, samples: int, inputs: int) -> Told:
         own = {"units": self.units, "epochs": self.epochs}
         rates = ", ".join(f"{part * self.rate:g} for {share:.0%}" for share, part in SCHEDULE)
-        tuning = (
+        return {**own, "samples": len(x), "inputs": x.shape[1]}, (
             "Inputs and outputs at zero mean and unit deviation, float32, no weight decay.",
             f"ADAM with batches of {self.batch} for {self.epochs} epochs, its rate falling in "
             f"steps: {rates} of the epochs.",
         )
-        return {**own, "samples": samples, "inputs": inputs}, tuning
+
+    def _answer_scaled(self, x: Array) -> Array:
+        found = self._net.predict(x.astype(np.float32))
+        return np.asarray(found.reshape(len(x), -1), dtype=np.float64)

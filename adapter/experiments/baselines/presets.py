@@ -24,16 +24,6 @@ from adapter.experiments.baselines.least_squares import RegressorLeastSquares
 from adapter.experiments.baselines.network import FeedForward
 from adapter.model.spatial import Array
 
-# What is cut down where the full size is not asked for; everything else is as in the paper.
-FULL_EPOCHS, DEFAULT_EPOCHS = 200, 40
-DEFAULT_MEMBERS = 20
-FULL_STEPS, DEFAULT_STEPS = 30_000, 6_000
-# Settings that are compared, and what of the default size is cut down in such a trial: it then
-# takes about a tenth of the training's time, or less.
-NETWORK_RATES, NETWORK_TRIAL = (1e-3, 2e-3, 4e-3), {"epochs": 4}
-SPREADS, RIDGES, COMMITTEE_TRIAL = (0.1, 0.2, 0.3), (1e-9, 1e-7), {"members": 1}
-LAGRANGIAN_RATES, LAGRANGIAN_TRIAL = (1e-3, 2e-3), {"steps": 600}
-
 Settings = Mapping[str, float]
 
 
@@ -47,7 +37,8 @@ class Choice:
         make: from settings (keyword arguments) to a learner that is ready to fit.
         candidates: settings of which the best on the validation part is taken; one alone where
             there is nothing to choose.
-        trial: further settings of the learners that are compared, smaller than the final one.
+        trial: further settings of the learners that are compared, smaller than the final one: a
+            trial takes about a tenth of the training's time, or less.
         otherwise: how the settings came about where nothing is chosen, a sentence.
     """
 
@@ -71,24 +62,23 @@ def learners(
         full: the paper's sizes, and long training; else what fits in some minutes.
         seed: of all of them.
     """
-    epochs = FULL_EPOCHS if full else DEFAULT_EPOCHS
-    members = MEMBERS if full else DEFAULT_MEMBERS
-    steps = FULL_STEPS if full else DEFAULT_STEPS
-    pairs = tuple({"spread": s, "ridge": r} for s, r in product(SPREADS, RIDGES))
+    # what is cut down where the full size is not asked for; everything else is as in the paper
+    epochs, members, steps = (200, MEMBERS, 30_000) if full else (40, 20, 6_000)
+    pairs = product((0.1, 0.2, 0.3), (1e-9, 1e-7))
     return (
         Choice(
             "FFNN",
             "Feed-forward network",
             partial(FeedForward, epochs=epochs, seed=seed),
-            tuple({"rate": rate} for rate in NETWORK_RATES),
-            NETWORK_TRIAL,
+            tuple({"rate": rate} for rate in (1e-3, 2e-3, 4e-3)),
+            {"epochs": 4},
         ),
         Choice(
             "ELM",
             "Committee of extreme learning machines",
             partial(ElmCommittee, members=members, seed=seed),
-            pairs,
-            COMMITTEE_TRIAL,
+            tuple({"spread": spread, "ridge": ridge} for spread, ridge in pairs),
+            {"members": 1},
         ),
         Choice(
             "GPR",
@@ -100,8 +90,8 @@ def learners(
             "DeLaN",
             "Deep Lagrangian network",
             partial(DeepLagrangian, columns, steps=steps, seed=seed),
-            tuple({"rate": rate} for rate in LAGRANGIAN_RATES),
-            LAGRANGIAN_TRIAL,
+            tuple({"rate": rate} for rate in (1e-3, 2e-3)),
+            {"steps": 600},
         ),
         Choice(
             "WLS",

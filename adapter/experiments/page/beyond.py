@@ -21,6 +21,7 @@ from adapter.report.style import (
     SIZES,
     Drawing,
     Panel,
+    legend,
     level,
     log_axis,
     time_axis,
@@ -55,10 +56,14 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
     if not robots:
         return None
     trials = [found for _, found in robots]
+    wrong = [found["most_confidence_wrong"] for found in trials]
     rows: list[tuple[str, list[str]]] = [
         ("trees found, every edge right", [f"{x['right']} of {x['trials']}" for x in trials]),
         ("least confidence in a right edge", [_share(x["least_confidence_right"]) for x in trials]),
-        ("most confidence in a wrong edge", [_wrong(x["most_confidence_wrong"]) for x in trials]),
+        (
+            "most confidence in a wrong edge",
+            [_share(x) if x > 0.0 else "none was reported" for x in wrong],
+        ),
         ("longest recording", [with_unit(x["motion_s"], "s", 3) for x in trials]),
         ("measured on every link", [_channels(x["measured"]) for x in trials]),
     ]
@@ -68,10 +73,6 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
 def _share(confidence: float) -> str:
     """Never rounded up to certainty."""
     return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
-
-
-def _wrong(confidence: float) -> str:
-    return _share(confidence) if confidence > 0.0 else "none was reported"
 
 
 def _channels(measured: str) -> str:
@@ -150,8 +151,6 @@ def _plot(t: Array, lines: Sequence[Line], goal: float | None) -> Drawing:
     ax.set_xlim(0.0, 1.04 * float(t[-1]))
     if goal is not None:
         level(ax, goal, f"goal {scientific(goal)}", left=True)
-    ax.legend(
-        frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="upper right", ncols=2
-    )
+    legend(ax, fontsize=SIZES["half"][2], loc="upper right", ncols=2)
     time_axis(drawing, SECONDS)
     return drawing

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import LogLocator
 
 from adapter.experiments.page.words import grouped, with_unit
 from adapter.experiments.results import AtlasResults
@@ -28,7 +28,9 @@ from adapter.report.style import (
     Panel,
     categories,
     joint_color,
+    legend,
     log_axis,
+    log_ticks,
     mark,
     power_of_ten,
     thin,
@@ -133,11 +135,7 @@ def epoch_panels(atlas: AtlasResults) -> list[Panel]:
 
 
 def draw_bones(
-    ax: Axes,
-    tree: Tree,
-    shown: Skeleton,
-    behind: bool = False,
-    only: Sequence[int] | None = None,
+    ax: Axes, tree: Tree, shown: Skeleton, behind: bool = False, only: Sequence[int] | None = None
 ) -> None:
     """Lines from each parent's origin to the joint's, and a dot there."""
     color = {j: joint_color(limb.color) for limb in limbs(tree) for j in limb.joints}
@@ -226,16 +224,8 @@ def _histogram(
     _magnitudes(ax, edges, sum(counts.values(), np.zeros(len(edges) - 1)))
     ax.set_ylim(0.0, 1.5 * ax.dataLim.y1)  # room for the legend, which the goal must not cross
     low, high = np.log10(ax.get_xlim())
-    missed = np.log10(KINEMATIC_GOAL) < 0.5 * (low + high)
-    ax.legend(
-        frameon=False,
-        labelcolor=MUTED,
-        fontsize=SIZES["third"][2],
-        loc="upper right" if missed else "upper left",
-        ncols=1,
-        handlelength=1.2,
-        borderaxespad=0.1,
-    )
+    side = "right" if np.log10(KINEMATIC_GOAL) < 0.5 * (low + high) else "left"
+    legend(ax, loc=f"upper {side}", ncols=1, handlelength=1.2, borderaxespad=0.1)
     mark(ax, KINEMATIC_GOAL, "goal", top=0.6)
     time_axis(drawing, "size of the error, in the unit of its kind")
     most = int(max(values.sum() for values in counts.values()))
@@ -249,9 +239,7 @@ def _magnitudes(ax: Axes, edges: Array, counts: Array) -> None:
     ax.set_xscale("log")
     first, last = 10.0 ** (low - 0.5), 10.0 ** (high + 0.5)
     ax.set_xlim(min(first, 0.25 * KINEMATIC_GOAL), max(last, 4.0 * KINEMATIC_GOAL))
-    ax.xaxis.set_major_locator(LogLocator(10, numticks=7))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    log_ticks(ax.xaxis, LogLocator(10, numticks=7), power_of_ten)
 
 
 def schema_panels(atlas: AtlasResults) -> list[Panel]:
@@ -299,5 +287,5 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
     low, high = np.min(shown), np.max(shown)
     log_axis(ax, 0.3 * low, 5.0 * high)
     categories(ax, [label for label, _ in atlas.snapshots])
-    ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["third"][2], loc="best")
+    legend(ax, loc="best")
     return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")

@@ -18,14 +18,7 @@ from adapter.experiments.page.figure4 import (
 from adapter.experiments.page.words import OURS, SETS, baselines, fopnet, letter
 from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
 from adapter.model.spatial import Array
-from adapter.report.style import (
-    STAND_IN,
-    Drawing,
-    Panel,
-    categories,
-    log_axis,
-    time_axis,
-)
+from adapter.report.style import STAND_IN, Drawing, Panel, categories, log_axis, time_axis
 
 SET_NAMES = {"train": "muted", "test": "accent", "control": "goal"}  # the page's colours
 SET_COLORS = {name: STAND_IN[color] for name, color in SET_NAMES.items()}

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from adapter.experiments.results import PandaResults
 from adapter.model.spatial import Array
-from adapter.report.schema_panels import rotation_path
+from adapter.report.schema_panels import FIRST_S, rotation_path
 from adapter.report.style import (
     ACCENT,
     INK,
@@ -25,15 +25,12 @@ from adapter.report.style import (
 from adapter.report.torque_panels import GROUPS
 from adapter.runs.score import TORQUE_GOAL
 
-FIRST_S = 0.05  # left end of a logarithmic time axis
 EARLY_SHARE = 0.2  # θ's start before this share of the run makes time logarithmic
 WORDS_SHARE = 0.08  # of a panel's height, on top, for the words of the mark
-THETA_STARTS = "θ starts"
 TITLES = (
     ("(a) λ: orientation of the joint frames", "rad", slice(0, 3)),
     ("(a) λ: position of the joint frames", "m", slice(3, 6)),
 )
-THETA_TITLES = "mass", "first moments mX mY mZ", "inertia XX to ZZ"
 
 
 def lambda_panels(panda: PandaResults) -> list[Panel]:
@@ -69,8 +66,8 @@ def theta_panels(panda: PandaResults) -> list[Panel]:
     t, theta = _some(panda, panda.theta_time_s, panda.theta)
     if len(t) < 2:
         return []
-    panels = []
-    for title, (unit, parts) in zip(THETA_TITLES, GROUPS, strict=True):
+    panels, titles = [], ("mass", "first moments mX mY mZ", "inertia XX to ZZ")
+    for title, (unit, parts) in zip(titles, GROUPS, strict=True):
         drawing = Drawing("half")
         for j in range(panda.tree.n):
             drawing.axes[0].plot(t, theta[:, j, parts], color=joint_color(j), linewidth=1.0)
@@ -140,6 +137,5 @@ def _finish(drawing: Drawing, t: Array, panda: PandaResults) -> None:
         log_time(ax, FIRST_S, last)
     else:
         ax.set_xlim(0.0, last)
-    if np.isfinite(panda.theta_start_s):
-        mark(ax, panda.theta_start_s, THETA_STARTS)
+    mark(ax, panda.theta_start_s, "θ starts")
     time_axis(drawing)

@@ -9,28 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.page import figure4, figure5, figure6
+from adapter.experiments.page import figure4, figure5, figure6, words
 from adapter.experiments.page.beyond import beyond
-from adapter.experiments.page.words import (
-    ATLAS_LEFT_OUT,
-    OURS,
-    PANDA_LEFT_OUT,
-    SETS,
-    advantage,
-    baselines,
-    best_baseline,
-    fopnet,
-    grouped,
-    headline,
-    last_ratio,
-    letter,
-    measured,
-    ours_text,
-    percent,
-    scientific,
-    sentences,
-    with_unit,
-)
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
@@ -40,13 +20,11 @@ from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW
 
-TEMPLATE = "experiment.html"
-NOT_STATED = "not stated"
 PAPER_LEARNERS = (
     ("a", "the feed-forward network"),
     ("b", "the committee of extreme learning machines"),
     ("c", "the Gaussian process"),
-    ("d", OURS),
+    ("d", words.OURS),
 )
 
 
@@ -61,7 +39,7 @@ def render_experiment(atlas: AtlasResults | None, panda: PandaResults | None, wr
     Raises:
         ValueError: results whose shapes do not fit their tree.
     """
-    return fill(TEMPLATE, context(atlas, panda, written), "adapter.experiments")
+    return fill("experiment.html", context(atlas, panda, written), "adapter.experiments")
 
 
 def write_experiment(
@@ -79,13 +57,13 @@ def write_experiment(
 def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str) -> dict[str, Any]:
     """What the template shows."""
     shown = [*(atlas_tiles(atlas) if atlas else []), *(panda_tiles(panda) if panda else [])]
-    reasons = [ATLAS_LEFT_OUT] if atlas is None else _atlas_reasons(atlas)
+    reasons = [words.ATLAS_LEFT_OUT] if atlas is None else _atlas_reasons(atlas)
     if panda is None:
-        reasons.append(PANDA_LEFT_OUT)
+        reasons.append(words.PANDA_LEFT_OUT)
     elif not math.isfinite(panda.theta_start_s):
         reasons.append("Fig. 6b: θ was not learned, it waits until λ has converged.")
     return {
-        "headline": headline(atlas, panda),
+        "headline": words.headline(atlas, panda),
         "tiles": shown,
         "columns": max(len(shown), 1),
         "left_out": reasons,
@@ -100,27 +78,31 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
 def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
     """Key figures of section IV.A, those that there are."""
     found = []
-    ours, best, times = fopnet(atlas), best_baseline(atlas), advantage(atlas)
+    ours, best, times = words.fopnet(atlas), words.best_baseline(atlas), words.advantage(atlas)
     if ours is not None and "control" in ours.median:
-        value = percent(ours.median["control"])
-        found.append(Tile(f"{OURS}, control set", value, "median relative error, eq. 20"))
+        value = words.percent(ours.median["control"])
+        found.append(Tile(f"{words.OURS}, control set", value, "median relative error, eq. 20"))
     if best is not None:
-        value = percent(best.median["control"])
+        value = words.percent(best.median["control"])
         found.append(Tile("Best baseline, control set", value, f"{best.name}; median, eq. 20"))
     if times is not None:
         note = f"times smaller on the arm, joints {arm_joints(atlas)}"
-        found.append(Tile("Advantage", scientific(times), note))
+        found.append(Tile("Advantage", words.scientific(times), note))
     return found
 
 
 def panda_tiles(panda: PandaResults) -> list[Tile]:
     """Key figures of section IV.B, those that there are."""
-    after, ratio = measured(panda.stated, "lambda_converged_s"), last_ratio(panda)
-    value = "not reached" if after is None else with_unit(after, "s", 3)
+    after, ratio = words.measured(panda.stated, "lambda_converged_s"), words.last_ratio(panda)
+    value = "not reached" if after is None else words.with_unit(after, "s", 3)
     found = [Tile("λ of the simulated Panda converged", value, "after the first motion")]
     if ratio is not None:
         found.append(
-            Tile("Its torque error at the end", scientific(ratio, 3), "times batch least squares")
+            Tile(
+                "Its torque error at the end",
+                words.scientific(ratio, 3),
+                "times batch least squares",
+            )
         )
     return found
 
@@ -129,6 +111,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
     histogram, moments = figure4.histogram_panels(atlas)
     paper, others = figure5.arm_panels(atlas)
     summary = figure5.side_by_side(atlas)
+    tuning = [(x.name, x.title.rstrip("."), words.sentences(x.tuning)) for x in atlas.learners]
     return {
         "n": atlas.tree.n,
         "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figure4.limbs(atlas.tree)],
@@ -141,11 +124,11 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
         "last": [figure5.arm_panel(atlas), *([summary] if summary else [])],
         "arm": arm_joints(atlas),
         "not_judged": _not_judged(atlas),
-        "compared": bool(baselines(atlas)),
+        "compared": bool(words.baselines(atlas)),
         "full": atlas.full,
         "stated": stated_table(atlas.stated),
         "learners": learner_table(atlas),
-        "tuning": [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners],
+        "tuning": tuning,
     }
 
 
@@ -159,7 +142,7 @@ def _not_converged(atlas: AtlasResults) -> str:
     names, samples = atlas.not_converged, atlas.numbers.get("learned_samples")
     if not names:
         return ""
-    few = "too few samples" if samples is None else f"too few samples ({grouped(samples)})"
+    few = "too few samples" if samples is None else f"too few samples ({words.grouped(samples)})"
     if len(names) == atlas.tree.n:
         return f"None of the {atlas.tree.n} joints had converged; {few}."
     whose = f"{len(names)} joint{'' if len(names) == 1 else 's'} had not converged"
@@ -202,7 +185,7 @@ def _atlas_reasons(atlas: AtlasResults) -> list[str]:
             reasons.append(f"Fig. 4{which}: λ's training has no {label}, it ended before.")
     if not any(sum(counts) for counts in atlas.error_counts.values()):
         reasons.append("Fig. 4f: no kinematic errors were counted.")
-    have = {letter(learner) for learner in atlas.learners if learner.boxes}
+    have = {words.letter(learner) for learner in atlas.learners if learner.boxes}
     for which, name in PAPER_LEARNERS:
         if which not in have:
             reasons.append(f"Fig. 5{which}: {name} was not run.")
@@ -211,7 +194,7 @@ def _atlas_reasons(atlas: AtlasResults) -> list[str]:
 
 def stated_table(items: Sequence[Stated]) -> Table | None:
     """What the paper states, what we measured, what differs; None without any."""
-    rows = [[item.what, item.paper or NOT_STATED, ours_text(item), item.note] for item in items]
+    rows = [[x.what, x.paper or "not stated", words.ours_text(x), x.note] for x in items]
     return Table(["", "Paper states", "We measured", "Remark"], rows) if rows else None
 
 
@@ -223,16 +206,16 @@ def learner_table(atlas: AtlasResults) -> Table | None:
     units = ["", "", "", "", "eq. 20", "eq. 20", "by joint, N m"]
     rows = []
     for learner in atlas.learners:
-        known = [s for s in SETS if s in learner.median or s in learner.rmse] or [DASH]
+        known = [s for s in words.SETS if s in learner.median or s in learner.rmse] or [DASH]
         for name in known:
             first = name == known[0]
-            row = [learner.name, _joints(learner), with_unit(learner.train_s, "s", 3)]
+            row = [learner.name, _joints(learner), words.with_unit(learner.train_s, "s", 3)]
             rows.append(
                 [
                     *(row if first else [""] * len(row)),
                     name,
-                    percent(learner.median.get(name)),
-                    percent(learner.p99.get(name)),
+                    words.percent(learner.median.get(name)),
+                    words.percent(learner.p99.get(name)),
                     _spread(learner.rmse.get(name)),
                 ]
             )
@@ -250,5 +233,5 @@ def _spread(values: np.ndarray | None) -> str:
     finite = finite[np.isfinite(finite)]
     if not len(finite):
         return DASH
-    low, high = scientific(float(finite.min())), scientific(float(finite.max()))
+    low, high = words.scientific(float(finite.min())), words.scientific(float(finite.max()))
     return low if low == high else f"{low}{NARROW}–{JOIN}{NARROW}{high}"

@@ -12,14 +12,12 @@ from numpy.typing import ArrayLike
 from adapter.errors import ModelError
 from adapter.model.locking import restricted
 from adapter.model.model_file import load_model
-from adapter.model.robot_names import ROBOT_FILES
+from adapter.model.robot_names import FOLDER, ROBOT_FILES
 from adapter.model.robot_names import robot_names as names
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import vector3
 from adapter.model.urdf import read_urdf
 from drivers.errors import choices
-
-_FOLDER = Path(__file__).parent
 
 
 def documented(
@@ -45,7 +43,7 @@ def documented(
     """
     text = str(name)
     if text in names():
-        return read_urdf(_FOLDER / f"{text}.urdf", joints, floating, gravity, lock)
+        return read_urdf(FOLDER / f"{text}.urdf", joints, floating, gravity, lock)
     suffix = Path(text).suffix.lower()
     if suffix not in (".urdf", ".json"):
         raise ModelError(f"no robot '{text}'; {choices(text, names(), ROBOT_FILES)}")

@@ -6,16 +6,15 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from adapter.model.robot_names import FOLDER
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.urdf import read_urdf
 
-FOLDER = Path(__file__).parent
 SAME_TURN, SAME_PLACE_M = 0.2, 0.05  # a learned λ may differ so much from the documented one
 SAME_LIMIT = 0.02  # rad
 
