@@ -17,11 +17,10 @@ from sim.noise_levels import NoiseLevels
 from sim.options import ROBOTS, SCENARIOS, check
 from sim.plant import Plant
 from sim.sensors import Imus
-from sim.truth import Array, Truth, direction, documented, facts_of, turn, turn_about
+from sim.truth import FLANGE_M, Array, Truth, direction, documented, facts_of, turn, turn_about
 
 FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
-FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
 BALL_RADIUS_M = 0.04  # m, the payload is a solid ball
 STAND_OFF_M = 0.05  # m, its centre is so far off the flange ...
 SIDE_STEP_M = 0.02  # m, ... and so far from the axis of joint 7

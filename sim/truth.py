@@ -17,6 +17,9 @@ from sim.effects import Effect
 Array = NDArray[np.float64]
 
 JOINT_LIMITS = ("lower", "upper", "velocity", "effort", "acceleration")
+FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
+FLANGE = np.eye(4)  # in the last link's frame
+FLANGE[2, 3] = FLANGE_M
 BETA_IS_ZERO = 1e-9  # below it (in sin β) only α + γ exists
 
 
@@ -107,6 +110,15 @@ class Truth:
     def lam(self) -> Array:
         """λ (n, 6), see `lam_of`."""
         return lam_of(self.R, self.p)
+
+    @property
+    def motor_inertia(self) -> Array:
+        """(n,) kg m² that the motors add to the joints at all times."""
+        found = np.zeros(self.n)
+        for effect in self.effects:
+            if effect.name == "motor_inertia" and effect.interval_s is None:
+                found[effect.columns(self.n)] += effect.number("B")
+        return found
 
     def with_changes(self, **changes: Any) -> Truth:
         """A copy with some attributes replaced."""

@@ -13,8 +13,8 @@ from sim.fci.codec import TICK_S
 from sim.fci.settings import Settings
 from sim.plant import Plant
 from sim.rigid_bodies import payload_theta
-from sim.scenarios import FLANGE_M, Scenario
-from sim.truth import Array, Truth
+from sim.scenarios import Scenario
+from sim.truth import FLANGE, Array
 
 SERVED_SUBSTEPS = 2  # of 0.5 ms: friction in four takes most of a millisecond on a slow machine
 EXTERNAL_HZ = 10.0  # low pass of the external torque; the robot's own is not published
@@ -22,8 +22,6 @@ EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * EXTERNAL_HZ * TICK_S)
 # The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
 # is what a command per millisecond holds stable on a rigid arm.
 FASTEST_RATE = 60.0  # 1/s
-FLANGE = np.eye(4)  # in the last link's frame
-FLANGE[2, 3] = FLANGE_M
 SINGULAR = 0.01  # manipulability (m³, Yoshikawa) below which no wrench is told; 0.08 when ready
 
 
@@ -44,7 +42,7 @@ class Arm:
 
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         self.truth = scenario.truth.with_changes(effects=())  # all that the robot knows
-        self._motors = motor_inertias(scenario.truth)
+        self._motors = scenario.truth.motor_inertia
         self._plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
         self._n = self.truth.n
         self._still = np.zeros(self._n)
@@ -172,15 +170,6 @@ class Arm:
         """Pose and external wrench at the present posture."""
         self.pose, self.jacobian = self.frame(self.q)
         self.wrench = wrench_at(self.pose, self.jacobian, self._to_K, self.tau_external, SINGULAR)
-
-
-def motor_inertias(truth: Truth) -> Array:
-    """(n,) kg m² that the motors add to the joints at all times."""
-    found = np.zeros(truth.n)
-    for effect in truth.effects:
-        if effect.name == "motor_inertia" and effect.interval_s is None:
-            found[effect.columns(truth.n)] += effect.number("B")
-    return found
 
 
 @compiled

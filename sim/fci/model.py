@@ -24,8 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.scenarios import FLANGE_M
-from sim.truth import Truth, body_of
+from sim.truth import FLANGE_M, Truth, body_of
 from sim.urdf_writer import joint_text, limit_text, link_text
 
 _HEAD = """#include <math.h>
