@@ -92,13 +92,14 @@ def frame_ns(message: can.Message, bitrate: int, data_bitrate: int) -> int:
 def classic_bits(identifier: int, data: bytes) -> int:
     """Bits of a classic frame, stuff bits and gap included."""
     head = identifier << 7 | len(data)  # start, id, then three dominant bits and the length
-    count, state = stuffed(head, 19, (-1, 0))
-    for byte in data:
-        more, state = stuffed(byte, 8, state)
+    parts = [(head, 19), *((byte, 8) for byte in data)]
+    crc, count, state = 0, 0, (-1, 0)
+    for bits, width in parts:
+        crc = _crc_of(bits, width, crc)
+    for bits, width in (*parts, (crc, 15)):
+        more, state = stuffed(bits, width, state)
         count += more
-    more, state = stuffed(_crc15(head, data), 15, state)
-    count += more + (state[1] == 5)
-    return 19 + 8 * len(data) + 15 + count + CLASSIC_TAIL_BITS
+    return 19 + 8 * len(data) + 15 + count + (state[1] == 5) + CLASSIC_TAIL_BITS
 
 
 def fd_bits(identifier: int, data: bytes, switch: bool) -> tuple[int, int]:
@@ -116,16 +117,9 @@ def fd_bits(identifier: int, data: bytes, switch: bool) -> tuple[int, int]:
     return (slow, fast) if switch else (slow + fast, 0)
 
 
-def _crc15(head: int, data: bytes) -> int:
-    """Checksum of a classic frame from start of frame to the last data bit."""
-    crc = _crc_of(head, 19, 0)
-    for byte in data:
-        crc = _crc_of(byte, 8, crc)
-    return crc
-
-
 @lru_cache(maxsize=1 << 18)
 def _crc_of(bits: int, width: int, crc: int) -> int:
+    """Checksum of a classic frame with `width` bits more."""
     for k in range(width - 1, -1, -1):
         invert = (bits >> k & 1) ^ (crc >> 14)
         crc = (crc << 1 & 0x7FFF) ^ (CRC15 if invert else 0)
@@ -140,11 +134,6 @@ class Node(Protocol):
 
     def next_ns(self) -> int | None:
         """When it sends unasked; None for never."""
-
-
-def refuse() -> can.CanOperationError:
-    """What socketcan raises where the controller's queue is full."""
-    return can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
 
 
 class LineEnd(can.BusABC):
@@ -191,11 +180,7 @@ class Line:
         busy_ns: how long frames have occupied the wire so far.
     """
 
-    def __init__(
-        self,
-        fd: bool = True,
-        faults: Faults | None = None,
-    ) -> None:
+    def __init__(self, fd: bool = True, faults: Faults | None = None) -> None:
         """Lay the line.
 
         Args:
@@ -260,7 +245,8 @@ class Line:
         since_s = (self._now_ns - self.start_ns) * 1e-9
         struck = self._faults is not None and self._faults.strikes("enobufs", since_s)
         if struck or len(self._from_host) >= HOST_QUEUE:
-            raise refuse()
+            no_room = "Failed to transmit: No buffer space available"  # as socketcan has it
+            raise can.CanOperationError(no_room, errno.ENOBUFS)
         own = copy(message)  # the host may change what it sent
         own.is_rx = True
         self._from_host.append((self._now_ns, own))
