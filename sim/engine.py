@@ -66,12 +66,7 @@ class Engine:
         obstacles: what is in the arm's way.
     """
 
-    def __init__(
-        self,
-        truth: Truth,
-        substeps: int = SUBSTEPS,
-        end_stops: bool = False,
-    ) -> None:
+    def __init__(self, truth: Truth, substeps: int = SUBSTEPS, end_stops: bool = False) -> None:
         """Load the arm.
 
         Args:

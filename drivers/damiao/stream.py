@@ -11,7 +11,7 @@ import can
 from drivers.damiao import codec
 from drivers.damiao.bus import ERROR_FRAME, UNREADABLE, Frame, Wire, message_for
 from drivers.damiao.codec import CODES, FRAME_BYTES, Q_CODES, Scales, temperature
-from drivers.damiao.connect import fault_sentence
+from drivers.damiao.connect import NAP_S, fault_sentence
 from drivers.damiao.settings import BusSettings
 from drivers.damiao.tables import (
     BUS_OFF,
@@ -26,7 +26,6 @@ from drivers.damiao.timing import NOTHING, ArrivalClock, Reading, at_instant
 from drivers.interface import DriverError, Intake
 
 SEND_FAILURES = 20  # ticks in a row in which a frame could not be sent
-NAP_S = 0.0002
 REACH_TICKS = 5  # a joint's motion is predicted over so many
 SILENT_NS = 100_000_000
 SILENT_TICKS = 10

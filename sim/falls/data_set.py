@@ -27,7 +27,7 @@ import pybullet as bullet
 
 from sim.falls import fall
 from sim.falls.fall import RATE_HZ, FallRecord, babble
-from sim.falls.tree_truth import TreeTruth, atlas
+from sim.falls.tree_truth import TreeLimits, TreeTruth, atlas
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
@@ -249,7 +249,7 @@ def _key(truth: TreeTruth, flight: Flight) -> str:
         "format": FORMAT,
         "simulator": bullet.getAPIVersion(),
         "tree": [truth.parent, *(x.tolist() for x in (truth.R, truth.p, truth.theta))],
-        "limits": truth.as_dict()["limits"],
+        "limits": {k: getattr(truth.limits, k).tolist() for k in TreeLimits.__slots__},
         "gravity": truth.gravity.tolist(),
         "feedback": [fall.BANDWIDTH, fall.DAMPING],
         "babbling": {

@@ -80,9 +80,13 @@ def open_scan(path: Path) -> Scan:
         return BagScan(path, ".db3")
     if head.startswith(_ROS1):
         return BagScan(path, ".bag")
-    if any(head.startswith(magic) for magic in _PACKED):
-        return _unpacked(path, head)
-    return McapOfAnyRos(path)
+    unpack = _unpacker(head)
+    return McapOfAnyRos(path) if unpack is None else _unpacked(path, unpack)
+
+
+def _unpacker(head: bytes) -> Callable[[Any], Any] | None:
+    """What unpacks a file that begins so; None where it is not packed."""
+    return next((unpack for magic, unpack in _PACKED.items() if head.startswith(magic)), None)
 
 
 def is_recording(path: Path) -> bool:
@@ -95,7 +99,7 @@ def is_recording(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             head = file.read(len(_SQLITE))
-            unpack = next((f for magic, f in _PACKED.items() if head.startswith(magic)), None)
+            unpack = _unpacker(head)
             if unpack is not None:
                 file.seek(0)
                 head = unpack(file).read(len(_SQLITE))
@@ -172,9 +176,8 @@ class _Growth:
         return b"".join(parts)
 
 
-def _unpacked(path: Path, head: bytes) -> Scan:
+def _unpacked(path: Path, unpack: Callable[[Any], Any]) -> Scan:
     """What lies in a compressed file; errors and warnings name the file itself."""
-    unpack = next(unpack for magic, unpack in _PACKED.items() if head.startswith(magic))
     growth = _Growth(path, path.stat().st_size)
     with ExitStack() as until:
         whole = Path(until.enter_context(tempfile.TemporaryDirectory())) / "unpacked"
@@ -186,7 +189,7 @@ def _unpacked(path: Path, head: bytes) -> Scan:
         except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError) as error:
             raise DriverError(f"{path}: cannot be unpacked: {error}") from error
         with whole.open("rb") as file:
-            if file.read(len(_ZSTD)).startswith(tuple(_PACKED)):
+            if _unpacker(file.read(len(_ZSTD))):
                 raise DriverError(f"{path}: is packed twice; unpack it once")
         try:
             scan = open_scan(whole)
