@@ -49,10 +49,7 @@ class ExampleArm:
     link_names: tuple[str, ...] = ()  # no sensors on the links
 
     def __init__(
-        self,
-        address: str,
-        joint_names: Sequence[str] | None = None,
-        allow_motion: bool = False,
+        self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
         place = Address.of(address, OPTIONS)
         self._where = (place.host, place.port or DEFAULT_PORT)

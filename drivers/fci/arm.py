@@ -74,10 +74,7 @@ class FciArm:
     link_names: tuple[str, ...] = ()
 
     def __init__(
-        self,
-        address: str,
-        joint_names: Sequence[str] | None = None,
-        allow_motion: bool = False,
+        self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
         self._target = parse(address)
         self._safeguards = parse_safeguards(address, self._target.options)

@@ -59,10 +59,7 @@ class Ros2Arm:
     link_names: tuple[str, ...] = ()
 
     def __init__(
-        self,
-        address: str,
-        joint_names: Sequence[str] | None = None,
-        allow_motion: bool = False,
+        self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
         self._settings = where = parse(address)
         names = tuple(joint_names or where.joints)

@@ -13,13 +13,7 @@ import math
 from dataclasses import dataclass
 
 from drivers.errors import choices
-from sim.damiao.codec import (
-    AT_REST,
-    INTEGER_REGISTERS,
-    FullScale,
-    decode_command,
-    encode_feedback,
-)
+from sim.damiao.codec import AT_REST, INTEGER_REGISTERS, FullScale, decode_command, encode_feedback
 
 DISABLED, ENABLED = 0x0, 0x1
 OVER_VOLTAGE, UNDER_VOLTAGE, OVER_CURRENT = 0x8, 0x9, 0xA

@@ -27,9 +27,7 @@ class Ticks:
     """
 
     def __init__(
-        self,
-        now: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[int], None] = _sleep_to,
+        self, now: Callable[[], int] = time.monotonic_ns, sleep: Callable[[int], None] = _sleep_to
     ) -> None:
         self._now, self._sleep = now, sleep
         self._due = self._slipped = 0

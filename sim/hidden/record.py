@@ -95,10 +95,7 @@ def log_of(
 
 
 def write(
-    trial: Trial,
-    folder: Path | str,
-    recording: Log | None = None,
-    simulator: str = "pybullet",
+    trial: Trial, folder: Path | str, recording: Log | None = None, simulator: str = "pybullet"
 ) -> tuple[Path, Path, Path]:
     """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths.
 

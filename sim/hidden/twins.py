@@ -18,14 +18,7 @@ from scipy.signal import lfilter
 from drivers.files.mcap import Log
 from sim.hidden.motion import MARGIN_RAD, hand, points
 from sim.hidden.record import log_of
-from sim.hidden.sizes import (
-    Bristles,
-    box_moments,
-    draw_bristles,
-    log_uniform,
-    sizes,
-    wrist_shares,
-)
+from sim.hidden.sizes import Bristles, box_moments, draw_bristles, log_uniform, sizes, wrist_shares
 from sim.hidden.trial import first_order, wrong_body
 from sim.noise import levels_of
 from sim.truth import FLANGE_M, Array, Truth, panda, theta_of

@@ -130,10 +130,7 @@ def test_a_driver_under_garbage():
     rng = np.random.default_rng(3)
     bus = MotorBus(Bank(motion=lambda t: (0.3, 0.0, 1.0)))
     arm = DamiaoArm(
-        "can://x?interface=virtual",
-        bus=bus,
-        now_ns=bus.clock.now_ns,
-        wall_ns=bus.clock.wall_ns,
+        "can://x?interface=virtual", bus=bus, now_ns=bus.clock.now_ns, wall_ns=bus.clock.wall_ns
     )
     arm.connect()
     good = [reply_bytes(j + 1, 0, LIMITS[j], 0.3, 0.0, 1.0) for j in range(7)]
