@@ -24,6 +24,7 @@ TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of it
 BALL_RADIUS_M = 0.04  # m, the payload is a solid ball
 STAND_OFF_M = 0.05  # m, its centre is so far off the flange ...
 SIDE_STEP_M = 0.02  # m, ... and so far from the axis of joint 7
+BALL_AT = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +93,7 @@ def payload_at_20s(
     rng: np.random.Generator, robot: str, mass: float = 1.0, t_s: float = 20.0
 ) -> Truth:
     """A ball of `mass` kg at the flange after `t_s`."""
-    com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
-    ball = payload(mass, com, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
+    ball = payload(mass, BALL_AT, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
     return documented(robot).with_changes(effects=(ball,))
 
 
@@ -190,7 +190,6 @@ def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
     if "floor" in trouble:
         effects.append(Effect("x_floor", (), {"height": float(trouble["floor"])}, since))
     if "load" in trouble:
-        com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
-        load = payload(float(trouble["load"]), com)
+        load = payload(float(trouble["load"]), BALL_AT)
         effects.append(Effect(load.name, (), load.parameters, (-1.0, since[0])))
     return truth.with_changes(effects=tuple(effects))

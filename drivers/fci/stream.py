@@ -136,7 +136,6 @@ class StateStream:
 
     Attributes:
         arrived_ns: CLOCK_MONOTONIC, of the last state.
-        unsent: commands that the operating system did not take.
     """
 
     def __init__(self, connection: Connection, account: StateIntake) -> None:
@@ -146,7 +145,6 @@ class StateStream:
         self._restarts = 0
         self._last_refused = ""
         self.arrived_ns = 0
-        self.unsent = 0
         self._start = 0
 
     @property
@@ -209,7 +207,6 @@ class StateStream:
         try:
             self._connection.udp.sendto(datagram, socket.MSG_DONTWAIT, where)
         except OSError as error:
-            self.unsent += 1
             self._account.intake.note("unsent", f"the network did not take a command ({error})")
 
     def silence(self) -> str:

@@ -21,7 +21,6 @@ from sim.damiao.bus import address_of, check_alone, open_bus
 from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
 from sim.damiao.faults import HOT_C, JUMP_RAD, SPIKE_RAD, STATUS, Faults, Outbox
 from sim.damiao.motor import Motor, motor_set
-from sim.damiao.options import check
 from sim.effects import ENCODER, TORQUE
 from sim.ending import Ending, sum_up
 from sim.engine import DriveLaw
@@ -377,7 +376,6 @@ class Boards:
 
 def run(args: argparse.Namespace) -> int:
     """`adapter sim can`: serve until a signal comes or the time is over. Raises ValueError."""
-    check(args)
     options = options_of(args.set)
     scenario = build(args.scenario, args.seed, **options)
     noise = scenario.noise if options.keys() & {"noise", "levels"} else None

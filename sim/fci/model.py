@@ -53,13 +53,10 @@ def _table(name: str, values: Iterable[float]) -> str:
 
 def _frames() -> list[str]:
     """The functions that differ only in the frame; the first joint's Jacobians take no posture."""
-    out = []
+    out = ["static const double ZERO[N];\n"]
     for k in range(1, 10):
         tool, given = ("tool", "const double *tool, ") if k == 9 else ("0", "")
-        q, posture = ("0", "") if k == 1 else ("q", "const double *q, ")
-        if k == 1:
-            out.append("static const double ZERO[N];\n")
-            q = "ZERO"
+        q, posture = ("ZERO", "") if k == 1 else ("q", "const double *q, ")
         count = min(k, 8)
         for name, body in (("Ji_J_J", 1), ("O_J_J", 0)):
             call = f"jacobian({q}, {count}, {tool}, {body}, out)"

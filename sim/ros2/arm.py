@@ -32,7 +32,7 @@ from sim.ending import Ending, sum_up
 from sim.faults import Fault, read_fault
 from sim.fci.clock import PRIORITY, Ticks, undisturbed
 from sim.options import options_of
-from sim.ros2.options import KINDS, check
+from sim.ros2.options import KINDS
 from sim.scenarios import Scenario, build
 from sim.truth import Truth
 from sim.urdf_writer import joint_text, limit_text
@@ -234,7 +234,6 @@ def description(truth: Truth) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """`adapter sim ros2`: serve until a signal comes or the time is over. Raises ValueError."""
-    check(args)
     scenario = build(args.scenario, args.seed, **options_of(args.set))
     place = Place(
         args.domain, args.states, args.commands, args.every, args.watch, not args.no_description
