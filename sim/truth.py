@@ -9,14 +9,10 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.dynamics import Frames, resting
-from sim.effects import Effect
+from sim.effects import Array, Effect
 
-Array = NDArray[np.float64]
-
-JOINT_LIMITS = ("lower", "upper", "velocity", "effort", "acceleration")
 FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
 FLANGE = np.eye(4)  # in the last link's frame
 FLANGE[2, 3] = FLANGE_M
@@ -146,7 +142,8 @@ def documented(robot: str) -> Truth:
     facts = facts_of(robot)
     joints = facts["joint"]
     slowing = {key: np.array(values) for key, values in facts.get("slowing", {}).items()}
-    rows = {key: np.array([j[key] for j in joints]) for key in JOINT_LIMITS}
+    keys = "lower", "upper", "velocity", "effort", "acceleration"
+    rows = {key: np.array([j[key] for j in joints]) for key in keys}
     return Truth(
         joint_names=tuple(j["name"] for j in joints),
         link_names=tuple(j["link"] for j in joints),
