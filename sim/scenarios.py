@@ -17,7 +17,7 @@ from sim.noise_levels import NoiseLevels
 from sim.options import ROBOTS, SCENARIOS, check
 from sim.plant import Plant
 from sim.sensors import Imus
-from sim.truth import FLANGE_M, Array, Truth, direction, documented, facts_of, turn, turn_about
+from sim.truth import FLANGE_M, Truth, direction, documented, facts_of, turn, turn_about
 
 FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
@@ -50,9 +50,10 @@ class Scenario:
     def __post_init__(self) -> None:
         Imus(self.truth.link_names, self.imus, self.seed, PERIOD_S)
 
-    def plant(self, q0: Array | None = None, substeps: int = SUBSTEPS) -> Plant:
-        """A fresh arm at t = 0, at rest at q0 (n,) rad or at the truth's own posture."""
-        return Plant(self.truth, self.seed, self.noise, self.imus or self.links, q0, substeps)
+    def plant(self, substeps: int = SUBSTEPS) -> Plant:
+        """A fresh arm at t = 0, at rest at the truth's own posture."""
+        links = self.imus or self.links
+        return Plant(self.truth, self.seed, self.noise, links, substeps=substeps)
 
     def as_dict(self) -> dict[str, Any]:
         """What a truth file holds."""
