@@ -11,7 +11,6 @@ which enters the step implicitly; all else is taken as it is at the middle of th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -51,20 +50,11 @@ class Row(IntEnum):
 ROW = 8  # numbers
 
 
-@dataclass(frozen=True, eq=False)
-class Losses:
-    """Torques of the effects at one instant, (n,) each; `explicit` is all but friction."""
-
-    explicit: Array
-    viscous: Array
-    positive: Array
-    negative: Array
-    armature: Array
-
-    def friction(self, v: Array) -> Array:
-        """f(v) (n,) N m."""
-        level = np.where(v > 0, self.positive, self.negative)
-        return self.viscous * v + level * np.tanh(v / COULOMB_WIDTH)
+def friction(parts: Array, v: Array) -> Array:
+    """f(v) (n,) N m of the parts (5, n) that `add_up` gives."""
+    _, viscous, positive, negative, _ = parts
+    level = np.where(v > 0, positive, negative)
+    return np.asarray(viscous * v + level * np.tanh(v / COULOMB_WIDTH))
 
 
 def rows_of(truth: Truth) -> Array:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sim import dynamics
 from sim.dynamics import Frames, resting
 from sim.effects import Array, Effect
 
@@ -115,6 +116,14 @@ class Truth:
             if effect.name == "motor_inertia" and effect.interval_s is None:
                 found[effect.columns(self.n)] += effect.number("B")
         return found
+
+    def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Inverse dynamics (n,) N m of the rigid arm."""
+        return np.asarray(dynamics.torques(self.frames, self.theta, self.base, q, dq, ddq))
+
+    def mass_matrix(self, q: Array) -> Array:
+        """(n, n) kg m² of the rigid arm."""
+        return np.asarray(dynamics.mass_matrix(self.frames, self.theta, q))
 
     def with_changes(self, **changes: Any) -> Truth:
         """A copy with some attributes replaced."""

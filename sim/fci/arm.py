@@ -6,7 +6,7 @@ import numpy as np
 
 from drivers.interface import DriverError, JointSample
 from sim.compiled import compiled
-from sim.dynamics import cross, end_effector, mass_matrix, torques
+from sim.dynamics import cross, end_effector
 from sim.effects import payload
 from sim.fci.cartesian import difference, impedance, posture
 from sim.fci.codec import TICK_S
@@ -71,10 +71,11 @@ class Arm:
     def refresh(self, settings: Settings) -> None:
         """Take over what a client set: end effector, stiffness frame and load."""
         self._tool, self._to_K = FLANGE @ settings.F_T_EE, settings.EE_T_K
-        self._theta = self.truth.theta.copy()
+        theta = self.truth.theta.copy()
         m, com, inertia = settings.load
         if m > 0.0:
-            self._theta[-1] += payload_theta(payload(m, FLANGE[:3, 3] + com, inertia))
+            theta[-1] += payload_theta(payload(m, FLANGE[:3, 3] + com, inertia))
+        self._loaded = self.truth.with_changes(theta=theta)
 
     def drive(self, tau: Array) -> None:
         """Torques on top of gravity, reached at the end of the next tick; brakes open."""
@@ -136,13 +137,11 @@ class Arm:
 
     def model(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (7,) of the internal model for a motion, N m."""
-        truth = self.truth
-        rigid = torques(truth.frames, self._theta, truth.base, q, dq, ddq)
-        return np.asarray(rigid + self._motors * ddq)
+        return np.asarray(self._loaded.torques(q, dq, ddq) + self._motors * ddq)
 
     def mass(self, q: Array) -> Array:
         """(7, 7) mass matrix of the internal model, kg m²."""
-        M = np.asarray(mass_matrix(self.truth.frames, self._theta, q))
+        M = self._loaded.mass_matrix(q)
         M.flat[:: self._n + 1] += self._motors
         return M
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from drivers.files.mcap import Commands, Log, write_log
 from drivers.interface import JointSample
-from sim.dynamics import torques
 from sim.hidden.trial import Trial, nominal_urdf, seal
 from sim.noise import SensorNoise, levels_of
 from sim.plant import PERIOD_NS, Plant
@@ -50,7 +49,7 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
         total += PERIOD_S * behind
         push = RATE_S**2 * (behind + INTEGRAL_S * total) + 2 * RATE_S * (speed - dq)
         ddq = acceleration + push
-        tau = torques(arm.frames, arm.theta, arm.base, q, dq, ddq) + motors * ddq
+        tau = arm.torques(q, dq, ddq) + motors * ddq
         tau = np.clip(tau, -arm.limits.effort, arm.limits.effort)
         out[0, k], out[1, k], out[2, k] = sample.q, sample.dq, sample.tau
         out[3, k] = tau
