@@ -49,10 +49,7 @@ class ExampleArm:
     link_names: tuple[str, ...] = ()  # no sensors on the links
 
     def __init__(
-        self,
-        address: str,
-        joint_names: Sequence[str] | None = None,
-        allow_motion: bool = False,
+        self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
         place = Address.of(address, OPTIONS)
         self._where = (place.host, place.port or DEFAULT_PORT)
@@ -137,7 +134,8 @@ class ExampleArm:
             return self._refused("bad_stamp", f"a stamp of {stamp_ns} ns cannot be; refused")
         if self._counter is not None and counter > self._counter + 1:
             intake.lost += counter - self._counter - 1
-            self._note("datagrams got lost; give the arm a network port of its own")
+            advice = "give the arm a network port of its own"
+            intake.note("lost", f"{self._name}: datagrams got lost; {advice}")
         self._counter = counter
         intake.used += 1
         # a copy: the sample belongs to the caller, and recv's bytes are read-only
@@ -146,15 +144,9 @@ class ExampleArm:
 
     def _refused(self, reason: str, why: str) -> JointSample | None:
         """Count a datagram that is not used; there is no sample."""
-        if not self.intake.refused[reason]:
-            self._note(why)
+        self.intake.note(reason, f"{self._name}: {why}")
         self.intake.refused[reason] += 1
         return None
-
-    def _note(self, sentence: str) -> None:
-        note = f"{self._name}: {sentence}"
-        if note not in self.intake.notes:
-            self.intake.notes.append(note)
 
     def command(self, tau: Array) -> None:
         """Send (n,) N m, gravity included.

@@ -109,11 +109,19 @@ class Intake:
     lost: int = 0
     notes: list[str] = field(default_factory=list)
     commands: CommandCount | None = None
+    _noted: set[str] = field(default_factory=set, repr=False, compare=False)
+
+    def note(self, kind: str, sentence: str) -> None:
+        """Write a sentence at the first occurrence of its kind."""
+        if kind not in self._noted:
+            self._noted.add(kind)
+            self.notes.append(sentence)
 
     def as_dict(self) -> dict[str, Any]:
         """As plain numbers and texts."""
         commands = None if self.commands is None else dict(vars(self.commands))
-        return {**vars(self), "refused": dict(self.refused), "commands": commands}
+        told = {key: value for key, value in vars(self).items() if key != "_noted"}
+        return {**told, "refused": dict(self.refused), "commands": commands}
 
 
 class Driver(Protocol):

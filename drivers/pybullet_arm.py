@@ -10,16 +10,10 @@ from drivers.interface import Array, DriverError, Intake, JointSample
 class Plant(Protocol):
     """What a simulated arm has to offer; whoever builds the driver hands one over."""
 
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+    period_ns: int
     compute_ns: int
-
-    @property
-    def joint_names(self) -> tuple[str, ...]: ...
-
-    @property
-    def link_names(self) -> tuple[str, ...]: ...
-
-    @property
-    def period_ns(self) -> int: ...
 
     def read(self) -> JointSample:
         """Move on by one period and give the sample there; the first call gives t = 0."""

@@ -22,7 +22,7 @@ import pybullet as bullet
 
 from sim.dynamics import end_effector
 from sim.effects import WRENCH
-from sim.joint_effects import Losses, add_up, bend, rows_of, step
+from sim.joint_effects import add_up, bend, friction, rows_of, step
 from sim.obstacles import Obstacles
 from sim.rigid_bodies import ArmClient, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
@@ -66,12 +66,7 @@ class Engine:
         obstacles: what is in the arm's way.
     """
 
-    def __init__(
-        self,
-        truth: Truth,
-        substeps: int = SUBSTEPS,
-        end_stops: bool = False,
-    ) -> None:
+    def __init__(self, truth: Truth, substeps: int = SUBSTEPS, end_stops: bool = False) -> None:
         """Load the arm.
 
         Args:
@@ -145,8 +140,8 @@ class Engine:
         if self._ddq is None:
             self._ddq = self.acceleration(self._q, dq, law.ff0)
         stage = self._stage  # ahead: by how much the Coriolis torque grows in half a sub-step
-        ahead = stage.torques(self._q, dq + h / 2 * self._ddq, self._rest)
-        ahead = ahead - stage.torques(self._q, dq, self._rest)
+        ahead = stage.truth.torques(self._q, dq + h / 2 * self._ddq, self._rest)
+        ahead = ahead - stage.truth.torques(self._q, dq, self._rest)
         self.stopped, self._mass = False, None
         # Where nothing depends on the motion the state is only asked for at the tick's end.
         acting = len(self._rows) or self._wrenches or self._end_stops or len(self.obstacles)
@@ -176,17 +171,17 @@ class Engine:
 
     def acceleration(self, q: Array, dq: Array, drive: Array) -> Array:
         """Joint acceleration (n,) rad/s² under driving torques `drive` (n,) N m."""
-        losses = self._losses(self._now(), q, dq, drive)
-        M, bias = self._stage.mass_matrix(q), self._stage.torques(q, dq, self._rest)
-        left = drive - losses.explicit - losses.friction(dq) - bias
-        M.flat[:: self._n + 1] += losses.armature
+        parts = self._parts(q, dq, drive)
+        M, bias = self.truth.mass_matrix(q), self.truth.torques(q, dq, self._rest)
+        left = drive - parts[0] - friction(parts, dq) - bias
+        M.flat[:: self._n + 1] += parts[4]
         return np.asarray(np.linalg.solve(M, left), float)
 
     def drive_for(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Driving torques (n,) N m that give the joint acceleration `ddq` (n,) rad/s²."""
-        rigid = self._stage.torques(q, dq, ddq)
-        losses = self._losses(self._now(), q, dq, rigid)
-        return rigid + losses.armature * ddq + losses.explicit + losses.friction(dq)
+        rigid = self.truth.torques(q, dq, ddq)
+        parts = self._parts(q, dq, rigid)
+        return np.asarray(rigid + parts[4] * ddq + parts[0] + friction(parts, dq))
 
     def close(self) -> None:
         """Free PyBullet's clients; may be called more than once."""
@@ -205,17 +200,18 @@ class Engine:
         for j, at, speed in zip(self._joints, stored.tolist(), dq.tolist(), strict=True):
             bullet.resetJointState(stage.arm, j, at, speed, physicsClientId=stage.client)
 
-    def _losses(self, t: float, q: Array, dq: Array, rigid: Array) -> Losses:
-        losses = Losses(*add_up(self._rows, t, q, dq, rigid, self._bent))
-        losses.explicit[:] -= self._contact(t, q)
-        return losses
+    def _parts(self, q: Array, dq: Array, rigid: Array) -> Array:
+        """(5, n) of `add_up` now, contacts included."""
+        parts = add_up(self._rows, self._now(), q, dq, rigid, self._bent)
+        parts[0] -= self._contact(self._now(), q)
+        return parts
 
     def _contact(self, t: float, q: Array) -> Array:
         """J^T wrench (n,) N m of what touches the last link at its origin."""
         torque = np.zeros(self._n)
         for start, end, wrench in self._wrenches:
             if start <= t < end:
-                _, J = end_effector(self._stage.truth.frames, q, np.eye(4))
+                _, J = end_effector(self.truth.frames, q, np.eye(4))
                 torque += J.T @ wrench
         return torque
 
@@ -239,8 +235,8 @@ class Engine:
             return np.asarray(got + self._contact(t, q))
         stage = self._stage
         if self._mass is None:  # one for a whole tick: it changes little, and only dv hangs on it
-            self._mass = stage.mass_matrix(q)
-        M, bias = self._mass.copy(), stage.torques(q, dq, self._rest) + ahead
+            self._mass = stage.truth.mass_matrix(q)
+        M, bias = self._mass.copy(), stage.truth.torques(q, dq, self._rest) + ahead
         ddq = self._rest if self._ddq is None else self._ddq
         middle = dq + self._h / 2 * ddq
         rigid = bias + M @ ddq

@@ -11,13 +11,12 @@ which enters the step implicitly; all else is taken as it is at the middle of th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
 from sim.compiled import compiled
-from sim.effects import MOTION, Effect
+from sim.effects import MOTION, SPECS, Effect
 from sim.truth import Array, Truth
 
 COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_WIDTH)
@@ -26,60 +25,36 @@ NEWTON_DONE = 1e-12  # rad/s
 
 
 class Row(IntEnum):
-    """Kinds of rows: kind, joint, other joint, three parameters, start and end."""
+    """Kinds of rows, one for each effect on a motion: kind, joint, other joint, three parameters
+    in the order of `SPECS`, start and end.
+    """
 
-    VISCOUS = 0
-    COULOMB = 1
-    STRIBECK = 2
-    LOAD_DEPENDENT = 3
-    DRIFT = 4
-    ARMATURE = 5
-    TORQUE_RIPPLE = 6
-    SPRING = 7
-    QUADRATIC_DRAG = 8
-    CUBIC_SPRING = 9
-    POSITION_FRICTION = 10
-    SINE = 11
-    VELOCITY_RIPPLE = 12
-    DAHL = 13
-    CROSS_VISCOUS = 14
+    VISCOUS_FRICTION = 0
+    COULOMB_FRICTION = 1
+    ASYMMETRIC_FRICTION = 2
+    STRIBECK_FRICTION = 3
+    BRISTLE_FRICTION = 4
+    LOAD_DEPENDENT_FRICTION = 5
+    FRICTION_DRIFT = 6
+    MOTOR_INERTIA = 7
+    TORQUE_RIPPLE = 8
+    JOINT_SPRING = 9
+    X_QUADRATIC_DRAG = 10
+    X_CUBIC_SPRING = 11
+    X_POSITION_FRICTION = 12
+    X_SINE_DISTURBANCE = 13
+    X_VELOCITY_RIPPLE = 14
+    X_CROSS_VISCOUS = 15
 
 
 ROW = 8  # numbers
-KINDS = {
-    "viscous_friction": (Row.VISCOUS, ("Fv",)),
-    "coulomb_friction": (Row.COULOMB, ("Fc", "Fc")),
-    "asymmetric_friction": (Row.COULOMB, ("Fc_pos", "Fc_neg")),
-    "stribeck_friction": (Row.STRIBECK, ("Fc", "Fs", "vs")),
-    "bristle_friction": (Row.DAHL, ("Fc", "s0")),
-    "load_dependent_friction": (Row.LOAD_DEPENDENT, ("Fl",)),
-    "friction_drift": (Row.DRIFT, ("dFc",)),
-    "motor_inertia": (Row.ARMATURE, ("B",)),
-    "torque_ripple": (Row.TORQUE_RIPPLE, ("a", "n", "phase")),
-    "joint_spring": (Row.SPRING, ("k", "q0")),
-    "x_quadratic_drag": (Row.QUADRATIC_DRAG, ("c",)),
-    "x_cubic_spring": (Row.CUBIC_SPRING, ("c", "q0")),
-    "x_position_friction": (Row.POSITION_FRICTION, ("A", "phase")),
-    "x_sine_disturbance": (Row.SINE, ("a", "f", "phase")),
-    "x_velocity_ripple": (Row.VELOCITY_RIPPLE, ("a", "n", "phase")),
-    "x_cross_viscous": (Row.CROSS_VISCOUS, ("c",)),
-}
 
 
-@dataclass(frozen=True, eq=False)
-class Losses:
-    """Torques of the effects at one instant, (n,) each; `explicit` is all but friction."""
-
-    explicit: Array
-    viscous: Array
-    positive: Array
-    negative: Array
-    armature: Array
-
-    def friction(self, v: Array) -> Array:
-        """f(v) (n,) N m."""
-        level = np.where(v > 0, self.positive, self.negative)
-        return self.viscous * v + level * np.tanh(v / COULOMB_WIDTH)
+def friction(parts: Array, v: Array) -> Array:
+    """f(v) (n,) N m of the parts (5, n) that `add_up` gives."""
+    _, viscous, positive, negative, _ = parts
+    level = np.where(v > 0, positive, negative)
+    return np.asarray(viscous * v + level * np.tanh(v / COULOMB_WIDTH))
 
 
 def rows_of(truth: Truth) -> Array:
@@ -90,7 +65,8 @@ def rows_of(truth: Truth) -> Array:
 
 
 def _rows(effect: Effect, n: int) -> list[list[float]]:
-    kind, keys = KINDS[effect.name]
+    _, needed, optional = SPECS[effect.name]
+    kind, keys = Row[effect.name.upper()], needed + optional
     numbers = [effect.number(key) for key in keys] + [0.0] * (3 - len(keys))
     columns: Sequence[int] = effect.columns(n)
     pairs = [(j, j) for j in columns]
@@ -113,34 +89,36 @@ def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array)
         if t < start or t >= end:
             continue
         kind, i, level = int(rows[r, 0]), int(j), 0.0  # level: of friction alike in both directions
-        if kind == Row.VISCOUS:
+        if kind == Row.VISCOUS_FRICTION:
             out[1, i] += a
-        elif kind == Row.COULOMB:
+        elif kind == Row.COULOMB_FRICTION:
+            level = a
+        elif kind == Row.ASYMMETRIC_FRICTION:
             out[2, i] += a
             out[3, i] += b
-        elif kind == Row.ARMATURE:
+        elif kind == Row.MOTOR_INERTIA:
             out[4, i] += a
-        elif kind == Row.QUADRATIC_DRAG:
+        elif kind == Row.X_QUADRATIC_DRAG:
             out[1, i] += a * abs(v[i])
-        elif kind == Row.VELOCITY_RIPPLE:
+        elif kind == Row.X_VELOCITY_RIPPLE:
             out[1, i] += a * np.sin(b * q[i] + c)
-        elif kind == Row.DAHL:
+        elif kind == Row.BRISTLE_FRICTION:
             out[0, i] += bent[r]
-        elif kind == Row.CROSS_VISCOUS:
+        elif kind == Row.X_CROSS_VISCOUS:
             out[0, i] += a * v[int(other)]
         elif kind == Row.TORQUE_RIPPLE:
             out[0, i] += a * np.sin(b * q[i] + c)
-        elif kind == Row.SPRING:
+        elif kind == Row.JOINT_SPRING:
             out[0, i] += a * (q[i] - b)
-        elif kind == Row.CUBIC_SPRING:
+        elif kind == Row.X_CUBIC_SPRING:
             out[0, i] += a * (q[i] - b) ** 3
-        elif kind == Row.SINE:
+        elif kind == Row.X_SINE_DISTURBANCE:
             out[0, i] += a * np.sin(2 * np.pi * b * t + c)
-        elif kind == Row.STRIBECK:
+        elif kind == Row.STRIBECK_FRICTION:
             level = a + (b - a) * np.exp(-((v[i] / c) ** 2))
-        elif kind == Row.LOAD_DEPENDENT:
+        elif kind == Row.LOAD_DEPENDENT_FRICTION:
             level = a * abs(rigid[i])
-        elif kind == Row.DRIFT:
+        elif kind == Row.FRICTION_DRIFT:
             level = a * (t - max(start, 0.0))
         else:  # of the position
             level = a * (1.0 + np.sin(q[i] + b))
@@ -153,7 +131,7 @@ def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array)
 def bend(rows: Array, v: Array, h: float, bent: Array) -> None:
     """Carry the Dahl bristles (r,) on by h (s) of motion at v (n,), N m: s0 dz = Fc dq - z |dq|."""
     for r in range(len(rows)):
-        if int(rows[r, 0]) == Row.DAHL:
+        if int(rows[r, 0]) == Row.BRISTLE_FRICTION:
             speed, level, way = v[int(rows[r, 1])], rows[r, 3], rows[r, 4]
             goal = level if speed > 0 else -level
             bent[r] = goal + (bent[r] - goal) * np.exp(-abs(speed) * h / way)

@@ -105,7 +105,12 @@ class _Stream:
 
 
 class _JointNoise:
-    """Draws (BLOCK, 3, n) noise of tau, dq and q."""
+    """Draws (BLOCK, 3, n) noise of tau, dq and q: white, and of tau more between 10 and 40 Hz.
+
+    That is band-passed white noise. The filter is applied as a product of a block's inputs and
+    their past with the shifted impulse responses, which takes a tenth of the time of a recursive
+    filter's call.
+    """
 
     def __init__(self, levels: NoiseLevels, n: int) -> None:
         white, band = _torque_parts(levels)
@@ -113,23 +118,7 @@ class _JointNoise:
         whole = 1 / np.sqrt(above)
         dq, q = (whole * np.asarray(x) for x in (levels.dq_above_50hz, levels.q_above_50hz))
         self._white = np.stack([np.broadcast_to(x, n) for x in (white, dq, q)])
-        self._band = _Band(np.broadcast_to(band, n))
-
-    def __call__(self, rng: np.random.Generator) -> Array:
-        block = self._white * rng.standard_normal((BLOCK, *self._white.shape))
-        block[:, 0] += self._band(rng)
-        return block
-
-
-class _Band:
-    """Gaussian noise between 10 and 40 Hz: white noise times a gain (n,), band-passed.
-
-    The filter is applied as a product of a block's inputs and their past with the shifted
-    impulse responses, which takes a tenth of the time of a recursive filter's call.
-    """
-
-    def __init__(self, gain: Array) -> None:
-        self._gain = gain
+        self._gain = np.broadcast_to(band, n)
         response = np.fft.irfft(band_response()[1])[:TAPS][::-1]
         self._rows = np.zeros((BLOCK, TAPS - 1 + BLOCK))
         for i, row in enumerate(self._rows):
@@ -137,11 +126,14 @@ class _Band:
         self._past: Array | None = None
 
     def __call__(self, rng: np.random.Generator) -> Array:
+        n = len(self._gain)
+        block = self._white * rng.standard_normal((BLOCK, *self._white.shape))
         if self._past is None:
-            self._past = rng.standard_normal((TAPS - 1, len(self._gain)))
-        inputs = np.concatenate((self._past, rng.standard_normal((BLOCK, len(self._gain)))))
+            self._past = rng.standard_normal((TAPS - 1, n))
+        inputs = np.concatenate((self._past, rng.standard_normal((BLOCK, n))))
         self._past = inputs[BLOCK:]
-        return self._gain * (self._rows @ inputs)
+        block[:, 0] += self._gain * (self._rows @ inputs)
+        return block
 
 
 def band_response() -> tuple[Array, NDArray[np.complex128]]:

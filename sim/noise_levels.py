@@ -7,11 +7,9 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.errors import choices
 
-Array = NDArray[np.float64]
 NOISES = ("real", "none")
 
 

@@ -14,14 +14,12 @@ import numpy as np
 
 from sim.dynamics import Frames, end_effector
 from sim.effects import OBSTACLE, Effect
-from sim.truth import Array
+from sim.truth import FLANGE, Array
 
 # Our choice: a joint gives 0.02 rad to 100 N m, a wall 5 mm to 100 N.
 HOLD_STIFFNESS, HOLD_DAMPING = 5000.0, 50.0  # N m/rad, N m s/rad
 WALL_STIFFNESS, WALL_DAMPING = 20000.0, 200.0  # N/m, N s/m
 GRIP = 0.5  # friction of the floor
-HAND = np.eye(4)  # in the last link's frame
-HAND[2, 3] = 0.107  # m, the flange
 
 
 class Obstacles:
@@ -51,7 +49,7 @@ class Obstacles:
             if not effect.acts(t):
                 self._places.pop(number, None)
             elif effect.name in ("x_wall", "x_floor"):
-                pose, J = end_effector(frames, q, HAND)
+                pose, J = end_effector(frames, q, FLANGE)
                 touch = self._wall if effect.name == "x_wall" else self._floor
                 push = touch(number, effect, pose[:3, 3], J[:3] @ dq)
                 self.force += float(np.linalg.norm(push))

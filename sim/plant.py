@@ -39,6 +39,7 @@ class Plant:
     unless there is a fault: a joint that left its range or exceeded its speed limit.
 
     Attributes:
+        joint_names, link_names: in the order of every array; period_ns: between two samples.
         saturated: the last command asked for more than an effort limit and was cut.
         braked: the brakes act.
         fault: why the arm refuses commands, or None.
@@ -65,7 +66,8 @@ class Plant:
             q0: (n,) posture at the start, rad; the truth's by default.
             substeps: of a tick.
         """
-        self.truth = truth
+        self.truth, self.period_ns = truth, PERIOD_NS
+        self.joint_names, self.link_names = truth.joint_names, truth.link_names
         self.saturated, self.braked = False, True
         self.fault: str | None = None
         self.compute_ns = 0
@@ -88,21 +90,6 @@ class Plant:
         self._clean: JointSample | None = None
         self._seen = self._q, self._dq, self._drive
         self._observe()  # what is compiled on first use is compiled before the clock runs
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of every array."""
-        return self.truth.joint_names
-
-    @property
-    def link_names(self) -> tuple[str, ...]:
-        """Names of the moving links, in the order of every array."""
-        return self.truth.link_names
-
-    @property
-    def period_ns(self) -> int:
-        """Time between two samples, ns."""
-        return PERIOD_NS
 
     def read(self) -> JointSample:
         """Move on by one period and say what arrives; the first call is t = 0, before any motion.

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pybullet as bullet
 
-from sim import dynamics
 from sim.effects import BODY, Effect
 from sim.truth import Array, Truth, body_of, theta_of, turn
 from sim.urdf_writer import principal, urdf
@@ -35,15 +34,6 @@ class ArmClient:
     truth: Truth
     client: int
     arm: int
-
-    def mass_matrix(self, q: Array) -> Array:
-        """(n, n) kg m²."""
-        return np.asarray(dynamics.mass_matrix(self.truth.frames, self.truth.theta, q))
-
-    def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Inverse dynamics (n,) N m."""
-        truth = self.truth
-        return np.asarray(dynamics.torques(truth.frames, truth.theta, truth.base, q, dq, ddq))
 
 
 def rigid_truths(truth: Truth, grid_s: float) -> list[tuple[float, Truth]]:

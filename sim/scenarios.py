@@ -17,14 +17,14 @@ from sim.noise_levels import NoiseLevels
 from sim.options import ROBOTS, SCENARIOS, check
 from sim.plant import Plant
 from sim.sensors import Imus
-from sim.truth import Array, Truth, direction, documented, facts_of, turn, turn_about
+from sim.truth import FLANGE_M, Truth, direction, documented, facts_of, turn, turn_about
 
 FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
-FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
 BALL_RADIUS_M = 0.04  # m, the payload is a solid ball
 STAND_OFF_M = 0.05  # m, its centre is so far off the flange ...
 SIDE_STEP_M = 0.02  # m, ... and so far from the axis of joint 7
+BALL_AT = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,10 @@ class Scenario:
     def __post_init__(self) -> None:
         Imus(self.truth.link_names, self.imus, self.seed, PERIOD_S)
 
-    def plant(self, q0: Array | None = None, substeps: int = SUBSTEPS) -> Plant:
-        """A fresh arm at t = 0, at rest at q0 (n,) rad or at the truth's own posture."""
-        return Plant(self.truth, self.seed, self.noise, self.imus or self.links, q0, substeps)
+    def plant(self, substeps: int = SUBSTEPS) -> Plant:
+        """A fresh arm at t = 0, at rest at the truth's own posture."""
+        links = self.imus or self.links
+        return Plant(self.truth, self.seed, self.noise, links, substeps=substeps)
 
     def as_dict(self) -> dict[str, Any]:
         """What a truth file holds."""
@@ -93,8 +94,7 @@ def payload_at_20s(
     rng: np.random.Generator, robot: str, mass: float = 1.0, t_s: float = 20.0
 ) -> Truth:
     """A ball of `mass` kg at the flange after `t_s`."""
-    com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
-    ball = payload(mass, com, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
+    ball = payload(mass, BALL_AT, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
     return documented(robot).with_changes(effects=(ball,))
 
 
@@ -191,7 +191,6 @@ def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
     if "floor" in trouble:
         effects.append(Effect("x_floor", (), {"height": float(trouble["floor"])}, since))
     if "load" in trouble:
-        com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
-        load = payload(float(trouble["load"]), com)
+        load = payload(float(trouble["load"]), BALL_AT)
         effects.append(Effect(load.name, (), load.parameters, (-1.0, since[0])))
     return truth.with_changes(effects=tuple(effects))

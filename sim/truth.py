@@ -9,14 +9,14 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim import dynamics
 from sim.dynamics import Frames, resting
-from sim.effects import Effect
+from sim.effects import Array, Effect
 
-Array = NDArray[np.float64]
-
-JOINT_LIMITS = ("lower", "upper", "velocity", "effort", "acceleration")
+FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
+FLANGE = np.eye(4)  # in the last link's frame
+FLANGE[2, 3] = FLANGE_M
 BETA_IS_ZERO = 1e-9  # below it (in sin β) only α + γ exists
 
 
@@ -108,6 +108,23 @@ class Truth:
         """λ (n, 6), see `lam_of`."""
         return lam_of(self.R, self.p)
 
+    @property
+    def motor_inertia(self) -> Array:
+        """(n,) kg m² that the motors add to the joints at all times."""
+        found = np.zeros(self.n)
+        for effect in self.effects:
+            if effect.name == "motor_inertia" and effect.interval_s is None:
+                found[effect.columns(self.n)] += effect.number("B")
+        return found
+
+    def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Inverse dynamics (n,) N m of the rigid arm."""
+        return np.asarray(dynamics.torques(self.frames, self.theta, self.base, q, dq, ddq))
+
+    def mass_matrix(self, q: Array) -> Array:
+        """(n, n) kg m² of the rigid arm."""
+        return np.asarray(dynamics.mass_matrix(self.frames, self.theta, q))
+
     def with_changes(self, **changes: Any) -> Truth:
         """A copy with some attributes replaced."""
         return replace(self, **changes)
@@ -134,7 +151,8 @@ def documented(robot: str) -> Truth:
     facts = facts_of(robot)
     joints = facts["joint"]
     slowing = {key: np.array(values) for key, values in facts.get("slowing", {}).items()}
-    rows = {key: np.array([j[key] for j in joints]) for key in JOINT_LIMITS}
+    keys = "lower", "upper", "velocity", "effort", "acceleration"
+    rows = {key: np.array([j[key] for j in joints]) for key in keys}
     return Truth(
         joint_names=tuple(j["name"] for j in joints),
         link_names=tuple(j["link"] for j in joints),

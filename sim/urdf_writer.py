@@ -12,14 +12,14 @@ import numpy as np
 from sim.truth import Array, Limits, Truth, body_of, to_rpy
 
 
-def urdf(truth: Truth) -> str:
-    """URDF of the rigid arm, without its effects."""
+def urdf(truth: Truth, limited: bool = False) -> str:
+    """URDF of the rigid arm, without its effects; joints with their limits where `limited`."""
     parts = ['<robot name="arm">', link_text("base", 1.0, np.zeros(3), np.eye(3))]
     parent = "base"
     for j, name in enumerate(truth.link_names):
         parts.append(link_text(name, *body_of(truth.theta[j])))
-        place = truth.p[j], truth.R[j]
-        parts.append(joint_text(truth.joint_names[j], (parent, name), place))
+        place, limits = (truth.p[j], truth.R[j]), limit_text(truth.limits, j) if limited else None
+        parts.append(joint_text(truth.joint_names[j], (parent, name), place, limits))
         parent = name
     return "\n".join([*parts, "</robot>"])
 

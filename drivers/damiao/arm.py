@@ -138,7 +138,7 @@ class DamiaoArm:
         replies.others_ask = self._guardian is not None
         strange = [j + 1 for j, x in enumerate(self.limits) if type_of(x) == "unknown type"]
         if strange:
-            replies.note(
+            self.intake.note(
                 "type",
                 f"motors {', '.join(map(str, strange))} scale as no known type does (motor "
                 f"{strange[0]}: {self.limits[strange[0] - 1]}); their own registers are used",
@@ -184,7 +184,7 @@ class DamiaoArm:
             self._replies.others_ask = True
 
     def _say_who_holds(self) -> None:
-        say = self._replies.note
+        say = self.intake.note
         if self._guardian is not None:
             pid = self._guardian.pid
             former = f" (it has relieved process {self._relieved})" if self._relieved else ""
@@ -252,7 +252,7 @@ class DamiaoArm:
         self._need_leave()
         frames, cut = torque_frames(tau, self._tau_max)
         if cut:
-            self._replies.note("cut", "a torque beyond a motor's TMAX was cut")
+            self.intake.note("cut", "a torque beyond a motor's TMAX was cut")
         if not self._driving:  # from holding to driving: the guardian's replies are not ours
             if self._guardian is not None:
                 self._replies.discard()
@@ -295,9 +295,9 @@ class DamiaoArm:
             self._guardian.memory.mode = GuardianMode.BRAKE
             if not self._guardian.alive:
                 gone = "the process that held the arm is gone; start anew"
-                self._replies.note("guardian gone", gone)
+                self.intake.note("guardian gone", gone)
         self._hand_over(brake(self._stream, self.limits, self._carried, self._beat))
-        self._replies.note("stopped", f"the arm was braked and stands; {held} holds it")
+        self.intake.note("stopped", f"the arm was braked and stands; {held} holds it")
 
     def close(self) -> None:
         """Release the bus; a driven arm is stopped first, and goes on being held."""
@@ -328,7 +328,7 @@ class DamiaoArm:
             return
         self._guardian.memory.beat_ns = self._now_ns()
         if self._guardian.memory.taken:
-            self._replies.note(
+            self.intake.note(
                 "taken", "no command came for 50 ms; the guardian braked the arm until the next one"
             )
 

@@ -7,7 +7,6 @@ import ctypes
 import os
 import socket
 import struct
-from typing import Protocol
 
 import can
 import msgpack
@@ -30,29 +29,17 @@ ERROR_FRAME, NOT_A_REPLY = 1, 2
 Frame = tuple[int, bytes | bytearray, float, int]
 
 
-class Wire(Protocol):
-    """What the driver needs of a bus."""
-
-    bus: can.BusABC
-
-    def waiting(self) -> list[Frame]:
-        """All frames that wait, at most `BATCH_LIMIT`, without waiting for any.
-
-        Raises can.CanError or OSError where the bus is gone.
-        """
-
-    def close(self) -> None:
-        """Close what was opened besides the bus."""
-
-
-class AnyWire:
+class Wire:
     """The frames of any python-can bus, taken one by one."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self.bus = bus
 
     def waiting(self) -> list[Frame]:
-        """See `Wire`."""
+        """All frames that wait, at most `BATCH_LIMIT`, without waiting for any.
+
+        Raises can.CanError or OSError where the bus is gone.
+        """
         frames: list[Frame] = []
         recv = self.bus.recv
         while len(frames) < BATCH_LIMIT:
@@ -68,10 +55,10 @@ class AnyWire:
         return frames
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Close what was opened besides the bus: nothing."""
 
 
-class MulticastWire:
+class MulticastWire(Wire):
     """The frames of python-can's udp_multicast bus, read from its socket.
 
     python-can takes 13 us for a frame, builds a Message and stops at the first datagram that is
@@ -79,7 +66,7 @@ class MulticastWire:
     """
 
     def __init__(self, bus: can.BusABC) -> None:
-        self.bus = bus
+        super().__init__(bus)
         self._socket = socket.socket(fileno=os.dup(bus.fileno()))
         with contextlib.suppress(OSError):  # the kernel's usual 200 kB last for 256 frames
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
@@ -153,7 +140,7 @@ def unpack_datagram(data: bytes, stamp_s: float) -> Frame:
 
 def wire_of(bus: can.BusABC) -> Wire:
     """The fastest way to take the frames of this bus."""
-    return MulticastWire(bus) if isinstance(bus, UdpMulticastBus) else AnyWire(bus)
+    return MulticastWire(bus) if isinstance(bus, UdpMulticastBus) else Wire(bus)
 
 
 def open_bus(settings: BusSettings) -> can.BusABC:

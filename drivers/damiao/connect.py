@@ -38,9 +38,7 @@ class Dialogue:
         self.echoes = False
 
     def ask(
-        self,
-        requests: Sequence[tuple[int, bytes]],
-        parse: Callable[[int, bytes | bytearray], T],
+        self, requests: Sequence[tuple[int, bytes]], parse: Callable[[int, bytes | bytearray], T]
     ) -> list[T]:
         """Send one request to each motor until each has replied.
 

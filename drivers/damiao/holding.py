@@ -209,7 +209,7 @@ def settle(
                 return hold, mean
             wanted, rest_s = mean, 0.0
             adopted += 1
-    stream.replies.note(
+    stream.replies.intake.note(
         "restless",
         f"the arm has not come to rest within {SETTLE_AT_MOST_S:g} s of being held; its first "
         "torques may not be those of its weight",
@@ -242,7 +242,7 @@ def _step(stream: MotorStream, braker: Braker, beat: Callable[[], None]) -> None
     try:
         stream.receive()
     except DriverError as error:  # a fault of one motor does not keep the others from holding
-        stream.replies.note(f"holding: {error}", str(error))
+        stream.replies.intake.note(f"holding: {error}", str(error))
 
 
 def _towards(old: Sequence[float], new: Sequence[float]) -> list[float]:

@@ -11,14 +11,21 @@ import can
 from drivers.damiao import codec
 from drivers.damiao.bus import ERROR_FRAME, UNREADABLE, Frame, Wire, message_for
 from drivers.damiao.codec import CODES, FRAME_BYTES, Q_CODES, Scales, temperature
-from drivers.damiao.connect import fault_sentence
+from drivers.damiao.connect import NAP_S, fault_sentence
 from drivers.damiao.settings import BusSettings
-from drivers.damiao.tables import DISABLED, ENABLED, HOT_DEGC, WARM_DEGC, fault_of, troubles_of
+from drivers.damiao.tables import (
+    BUS_OFF,
+    DISABLED,
+    ENABLED,
+    HOT_DEGC,
+    WARM_DEGC,
+    fault_of,
+    troubles_of,
+)
 from drivers.damiao.timing import NOTHING, ArrivalClock, Reading, at_instant
 from drivers.interface import DriverError, Intake
 
 SEND_FAILURES = 20  # ticks in a row in which a frame could not be sent
-NAP_S = 0.0002
 REACH_TICKS = 5  # a joint's motion is predicted over so many
 SILENT_NS = 100_000_000
 SILENT_TICKS = 10
@@ -51,7 +58,7 @@ class ReplyIntake:
         wire: open bus.
         settings: of it.
         limits: of each motor.
-        intake: where to count.
+        intake: where to count; `intake` of this, too.
         echoes: the bus hands back what was sent on it.
         driven: the motors are enabled and must stay so.
 
@@ -73,7 +80,7 @@ class ReplyIntake:
         driven: bool,
     ) -> None:
         n = settings.joints
-        self._wire, self._settings, self._intake = wire, settings, intake
+        self._wire, self._settings, self.intake = wire, settings, intake
         self._echoes, self._driven = echoes, driven
         self._reply_ns = round(1e3 * settings.budget.reply_us)
         self._reach_ns = REACH_TICKS * 1_000_000_000 // settings.rate_hz
@@ -95,16 +102,9 @@ class ReplyIntake:
         self._missed, self._any_missed = [0] * n, False
         self._alarms, self._alarmed_at = [0] * n, [-ALARM_TICKS - 1] * n
         self._unsettled, self._looks, self._ticks = [0] * n, 0, 0
-        self._said: set[str] = set()
         self.arrived_ns = 0
         self.others_ask = False
         self.clock = ArrivalClock()
-
-    def note(self, key: str, sentence: str) -> None:
-        """Write a sentence at its kind's first occurrence."""
-        if key not in self._said:
-            self._said.add(key)
-            self._intake.notes.append(sentence)
 
     def take(
         self, looked_ns: int, now_ns: int, wall_ns: int, frames: list[Frame], asked_ns: int
@@ -119,7 +119,7 @@ class ReplyIntake:
         Raises:
             DriverError: a motor reports a fault or is hot, three times in a row, or the bus is off.
         """
-        clock, intake, index = self.clock, self._intake, self._index
+        clock, intake, index = self.clock, self.intake, self._index
         pending, latest, before = self.pending, self.latest, self._before
         clock.begin(looked_ns, now_ns, wall_ns)
         first_ns, offset_ns, reply_ns = clock.first_ns, clock.offset_ns, self._reply_ns
@@ -170,7 +170,7 @@ class ReplyIntake:
                 self._look_at_temperatures(j, data[6], data[7])
             if not (0 < code_tau < CODES and 0 < code_dq < CODES):
                 what = "torque" if code_tau in (0, CODES) else "speed"
-                self.note(
+                self.intake.note(
                     f"end of scale {what} {j}",
                     f"motor {j + 1}: {what} at the end of its scale; the true value may lie beyond",
                 )
@@ -217,23 +217,23 @@ class ReplyIntake:
 
     def finish(self, on_the_way: bool) -> None:
         """Count what is still missing as lost, but for one reply of each joint `on_the_way`."""
-        self._intake.lost += sum(max(count - on_the_way, 0) for count in self.pending)
+        self.intake.lost += sum(max(count - on_the_way, 0) for count in self.pending)
         self.pending = [0] * len(self.pending)
 
     def _refuse(self, reason: Refusal, sentence: str = "") -> None:
-        self._intake.received += 1
-        self._intake.refused[reason] += 1
+        self.intake.received += 1
+        self.intake.refused[reason] += 1
         if sentence:
-            self.note(reason, f"{sentence}; it was refused")
+            self.intake.note(reason, f"{sentence}; it was refused")
 
     def _odd(self, can_id: int, data: bytes | bytearray, kind: int, j: int) -> None:
         """A frame that is no reply."""
         if kind == ERROR_FRAME:
             self._refuse(Refusal.ERROR_FRAME)
             for trouble in troubles_of(can_id, data, self._settings.channel):
-                if trouble.fatal:
-                    raise DriverError(trouble.sentence)
-                self.note(trouble.sentence, trouble.sentence)
+                if can_id & BUS_OFF:
+                    raise DriverError(trouble)
+                self.intake.note(trouble, trouble)
         elif can_id == UNREADABLE:
             self._refuse(Refusal.UNREADABLE, "a datagram that is no CAN frame came")
         elif j == OWN_ID and not kind:
@@ -292,7 +292,7 @@ class ReplyIntake:
             if degc >= HOT_DEGC and self._driven:
                 self._alarm(j, f"{who} are at {degc} deg C; stopped: let it cool")
             elif degc >= WARM_DEGC and self._repeats(j):
-                self.note(
+                self.intake.note(
                     f"warm {part} {j}",
                     f"{who} are at {degc} deg C; the run ends at {HOT_DEGC}: move less or slower",
                 )
@@ -308,7 +308,7 @@ class ReplyIntake:
             for j, count in enumerate(self._unsettled):
                 if count > 0:
                     self.pending[j] -= count
-                    self._intake.lost += count
+                    self.intake.lost += count
 
 
 class MotorStream:
@@ -408,4 +408,4 @@ class MotorStream:
                 "power, cable and terminators; a longer queue helps against bursts (ip link set "
                 f"{where} txqueuelen 100)"
             )
-        self.replies.note("send", f"{where}: a frame could not be sent ({failure})")
+        self.replies.intake.note("send", f"{where}: a frame could not be sent ({failure})")

@@ -97,29 +97,15 @@ def type_of(limits: Scales) -> str:
     return "unknown type"
 
 
-@dataclass(frozen=True)
-class BusTrouble:
-    """One thing that an error frame says.
+def troubles_of(can_id: int, data: bytes | bytearray, channel: str) -> list[str]:
+    """Read an error frame: `can_id` has one bit for each class of error in it; a sentence each.
 
-    Attributes:
-        sentence: what happened and what to do.
-        fatal: nothing can be sent or received any more.
+    After `BUS_OFF` nothing can be sent or received any more.
     """
-
-    sentence: str
-    fatal: bool = False
-
-
-def troubles_of(can_id: int, data: bytes | bytearray, channel: str) -> list[BusTrouble]:
-    """Read an error frame: `can_id` has one bit for each class of error in it; one entry each."""
     if can_id & BUS_OFF:
         return [
-            BusTrouble(
-                f"{channel} is bus-off after too many errors: check cable, terminators and bit "
-                f"rates, then restart it (ip link set {channel} down, then up, or type can "
-                "restart-ms 100)",
-                fatal=True,
-            )
+            f"{channel} is bus-off after too many errors: check cable, terminators and bit rates, "
+            f"then restart it (ip link set {channel} down, then up, or type can restart-ms 100)"
         ]
     said = [text for bit, text in CLASSES.items() if can_id & bit]
     if can_id & CONTROLLER:
@@ -129,6 +115,4 @@ def troubles_of(can_id: int, data: bytes | bytearray, channel: str) -> list[BusT
         ]
     if can_id & RESTARTED:
         said.append("the controller was restarted after bus-off")
-    return [
-        BusTrouble(f"{channel}: {text}") for text in said or ["an error frame of no known class"]
-    ]
+    return [f"{channel}: {text}" for text in said or ["an error frame of no known class"]]

@@ -61,13 +61,10 @@ class ArrivalClock:
         self.first_ns, self._looked_ns, self.now_ns = self._looked_ns - SLACK_NS, looked_ns, now_ns
         self._offset_before_ns, self.offset_ns = self.offset_ns, now_ns - wall_ns
 
-    def arrival(self, stamp_s: float) -> int:
-        """CLOCK_MONOTONIC instant, ns, between the last batch and this one."""
-        at = int(1e9 * stamp_s) + self.offset_ns
-        return at if self.first_ns <= at <= self.now_ns else self.unusual(stamp_s)
-
     def unusual(self, stamp_s: float) -> int:
-        """As `arrival`, for a stamp that the wall clock does not explain."""
+        """CLOCK_MONOTONIC instant, ns, between the last batch and this one, of an arrival whose
+        stamp the wall clock does not explain.
+        """
         stamp_ns = int(1e9 * stamp_s)
         first, now = self.first_ns, self.now_ns
         if not self.own_clock:

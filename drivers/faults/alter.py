@@ -52,36 +52,25 @@ def corrupt_stamp(sample: JointSample, rng: np.random.Generator) -> JointSample:
     return replace(sample, stamp_ns=stamp_ns)
 
 
+def with_reading(sample: JointSample, name: str, joint: int, value: float) -> JointSample:
+    """One reading (q, dq or tau) of one joint is another."""
+    values = getattr(sample, name).copy()
+    values[joint] = value
+    return replace(sample, **{name: values})
+
+
 def blank(sample: JointSample, rng: np.random.Generator) -> JointSample:
     """One reading of one joint, or all of them, is not a number."""
     joint, which = int(rng.integers(len(sample.q))), int(rng.integers(len(SIGNALS) + 1))
     for name in SIGNALS if which == len(SIGNALS) else SIGNALS[which : which + 1]:
-        values = getattr(sample, name).copy()
-        values[joint] = np.nan
-        sample = replace(sample, **{name: values})
+        sample = with_reading(sample, name, joint, np.nan)
     return sample
 
 
 def spike(sample: JointSample, rng: np.random.Generator, factor: float) -> JointSample:
     """One reading of one joint is off by up to `factor` times the usual size of a spike."""
     name = SIGNALS[rng.integers(len(SIGNALS))]
-    values = getattr(sample, name).copy()
     size = rng.uniform(LEAST_SPIKE, 1.0) * rng.choice([-1.0, 1.0])
-    values[rng.integers(len(values))] += factor * SPIKE_SIZE[name] * size
-    return replace(sample, **{name: values})
-
-
-def frozen(sample: JointSample, joint: int, held: tuple[float, float, float]) -> JointSample:
-    """The readings (q, dq, tau) of one joint are those held."""
-    for name, value in zip(SIGNALS, held, strict=True):
-        values = getattr(sample, name).copy()
-        values[joint] = value
-        sample = replace(sample, **{name: values})
-    return sample
-
-
-def shifted(sample: JointSample, joint: int, offset: float) -> JointSample:
-    """The position of one joint is off, rad."""
-    q = sample.q.copy()
-    q[joint] += offset
-    return replace(sample, q=q)
+    joint = int(rng.integers(len(sample.q)))
+    value = getattr(sample, name)[joint] + factor * SPIKE_SIZE[name] * size
+    return with_reading(sample, name, joint, value)

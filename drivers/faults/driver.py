@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivers.faults.alter import SIGNALS, blank, corrupt, corrupt_stamp, frozen, shifted, spike
+from drivers.faults.alter import SIGNALS, blank, corrupt, corrupt_stamp, spike, with_reading
 from drivers.faults.spec import KINDS, Fault, Faults
 from drivers.interface import Array, Driver, DriverError, EndOfStream, JointSample, PassedOn
 
@@ -86,7 +86,7 @@ class FaultyDriver(PassedOn):
         self._first_ns: int | None = None
         self._last: JointSample | None = None
         self._held: list[tuple[int, JointSample]] = []  # (read that it is due at, sample)
-        self._stuck: dict[Fault, tuple[float, float, float]] = {}
+        self._stuck: dict[Fault, list[float]] = {}
         self._reads = 0
         self._dead: str | None = None
 
@@ -202,10 +202,12 @@ class FaultyDriver(PassedOn):
             if now_s < fault.at_s or (fault.name == "stuck" and now_s >= fault.at_s + fault.amount):
                 continue
             if fault.name == "stuck":
-                q, dq, tau = (float(getattr(sample, name)[joint]) for name in SIGNALS)
-                sample = frozen(sample, joint, self._stuck.setdefault(fault, (q, dq, tau)))
+                now = [float(getattr(sample, name)[joint]) for name in SIGNALS]
+                held = self._stuck.setdefault(fault, now)
+                for name, value in zip(SIGNALS, held, strict=True):
+                    sample = with_reading(sample, name, joint, value)
             elif fault.name == "jump":
-                sample = shifted(sample, joint, fault.amount)
+                sample = with_reading(sample, "q", joint, sample.q[joint] + fault.amount)
             else:
                 sample = replace(sample, stamp_ns=sample.stamp_ns + round(1e9 * fault.amount))
             self.account.injected[fault.name] += 1

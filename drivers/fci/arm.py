@@ -74,10 +74,7 @@ class FciArm:
     link_names: tuple[str, ...] = ()
 
     def __init__(
-        self,
-        address: str,
-        joint_names: Sequence[str] | None = None,
-        allow_motion: bool = False,
+        self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
         self._target = parse(address)
         self._safeguards = parse_safeguards(address, self._target.options)
@@ -141,7 +138,7 @@ class FciArm:
                 former = Load(mass, np.array(rest[9:]), np.array(rest[:9]))
                 channel, wanted = connection.channel, self._safeguards
                 self._settings = RobotSettings(connection.version, channel, wanted)
-                self._account.note("settings", self._settings.apply(former))
+                self.intake.note("settings", self._settings.apply(former))
                 self.intake.commands = self._control.count
         except BaseException:
             self.close()
@@ -200,7 +197,7 @@ class FciArm:
             if self._settings is not None:
                 self._settings.restore()
         except DriverError as error:
-            self._account.note("close", str(error))
+            self.intake.note("close", str(error))
         finally:
             self._connection = self._stream = self._control = self._first = self._settings = None
             connection.close()
@@ -249,7 +246,7 @@ class FciArm:
         if mode in _LIMP_MODES:
             why = f" ({told(status.reflex_reason)})" if any(status.reflex_reason) else ""
             sentence = f"the robot {tables.ROBOT_MODE_MEANING[mode]}{why}"
-            self._account.note(f"mode {mode}", sentence)
+            self.intake.note(f"mode {mode}", sentence)
 
 
 def _next_of(stream: StateStream) -> State:

@@ -46,20 +46,11 @@ class Load(NamedTuple):
         return struct.pack("<13d", self.mass, *self.com, *self.inertia)
 
 
-class Safeguards(NamedTuple):
-    """What an address asks for.
+def parse(address: str, options: Mapping[str, str]) -> tuple[float | None, Load | None]:
+    """What the options of an address ask for: a factor of `TORQUES` and `FORCES`, and the load.
 
-    Attributes:
-        collision: factor of `TORQUES` and `FORCES`; None leaves the robot's thresholds alone.
-        load: to be set; None leaves the robot's alone.
+    None leaves the robot's thresholds, or its load, alone. Raises DriverError with the choices.
     """
-
-    collision: float | None
-    load: Load | None
-
-
-def parse(address: str, options: Mapping[str, str]) -> Safeguards:
-    """What the options of an address ask for. Raises DriverError with the choices."""
     text, collision = options.get("collision", "1"), None
     try:
         collision = None if text == KEEP else float(text)
@@ -70,7 +61,7 @@ def parse(address: str, options: Mapping[str, str]) -> Safeguards:
             f"'{address}': collision is a factor from {LEAST:g} to {MOST:g}, or {KEEP}"
         ) from error
     try:
-        return Safeguards(collision, read_load(options.get("load", "0")))
+        return collision, read_load(options.get("load", "0"))
     except ValueError as error:
         raise DriverError(
             f"'{address}': load is KG or KG,X,Y,Z (m from the flange) up to {HEAVIEST_KG:g} kg, "
@@ -95,10 +86,12 @@ class RobotSettings:
     Args:
         version: of the protocol.
         channel: connected.
-        wanted: by the address.
+        wanted: by the address, see `parse`.
     """
 
-    def __init__(self, version: int, channel: Channel, wanted: Safeguards) -> None:
+    def __init__(
+        self, version: int, channel: Channel, wanted: tuple[float | None, Load | None]
+    ) -> None:
         self._version, self._channel, self._wanted = version, channel, wanted
         self._thresholds_set = False
         self._former: Load | None = None

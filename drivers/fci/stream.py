@@ -59,18 +59,11 @@ class StateIntake:
     def __init__(self) -> None:
         self.intake = Intake()
         self.kernel_drops = 0
-        self._noted: set[str] = set()
         self._id = -1
         self._arrived_ns = 0
         self._unread = 0  # datagrams since the last good one of which only the number is known
         self._other_id, self._others = -1, 0
         self._refused_since_ns = 0
-
-    def note(self, kind: str, sentence: str) -> None:
-        """Write a sentence at the first occurrence of its kind."""
-        if kind not in self._noted:
-            self._noted.add(kind)
-            self.intake.notes.append(sentence)
 
     def arrived(self, record: Record) -> None:
         """Count a record, before anything else is done with it."""
@@ -81,7 +74,7 @@ class StateIntake:
             self._count(Refusal.TOO_SLOW, record.dropped)
         if record.kernel_drops != self.kernel_drops:
             self.kernel_drops = record.kernel_drops
-            self.note("kernel", "the kernel's buffer for states was full; it dropped some")
+            self.intake.note("kernel", "the kernel's buffer for states was full; it dropped some")
 
     def refuse(self, reason: Refusal, record: Record) -> None:
         """Count a datagram out."""
@@ -104,9 +97,11 @@ class StateIntake:
                 missing = max(0, ahead - 1 - self._unread)
                 self.intake.lost += missing
                 if missing:
-                    self.note("lost", "states got lost between the robot and this program")
+                    self.intake.note("lost", "states got lost between the robot and this program")
             elif self._is_new_count(message_id):
-                self.note("count", f"the robot went over to another count, from {message_id} on")
+                self.intake.note(
+                    "count", f"the robot went over to another count, from {message_id} on"
+                )
             elif ahead == 0:
                 return Refusal.REPEATED
             else:
@@ -129,7 +124,7 @@ class StateIntake:
     def _count(self, reason: Refusal, number: int) -> None:
         self.intake.refused[reason] += number
         if reason in _NOTES:
-            self.note(reason, _NOTES[reason])
+            self.intake.note(reason, _NOTES[reason])
 
 
 class StateStream:
@@ -141,7 +136,6 @@ class StateStream:
 
     Attributes:
         arrived_ns: CLOCK_MONOTONIC, of the last state.
-        unsent: commands that the operating system did not take.
     """
 
     def __init__(self, connection: Connection, account: StateIntake) -> None:
@@ -151,7 +145,6 @@ class StateStream:
         self._restarts = 0
         self._last_refused = ""
         self.arrived_ns = 0
-        self.unsent = 0
         self._start = 0
 
     @property
@@ -166,7 +159,7 @@ class StateStream:
             record = reader.next(wait_s)
             if reader.restarts != self._restarts:
                 self._restarts = reader.restarts
-                account.note("reader", "the process that reads states died; it was replaced")
+                account.intake.note("reader", "the process that reads states died; it was replaced")
             if record is None:
                 return None
             account.arrived(record)
@@ -214,8 +207,7 @@ class StateStream:
         try:
             self._connection.udp.sendto(datagram, socket.MSG_DONTWAIT, where)
         except OSError as error:
-            self.unsent += 1
-            self._account.note("unsent", f"the network did not take a command ({error})")
+            self._account.intake.note("unsent", f"the network did not take a command ({error})")
 
     def silence(self) -> str:
         """Why no state came, as far as can be told."""

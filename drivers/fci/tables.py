@@ -14,10 +14,7 @@ CONNECT = {PANDA: 0, FR3: 0}
 MOVE = {PANDA: 1, FR3: 1}
 STOP_MOVE = {PANDA: 2, FR3: 2}
 RECOVER = {PANDA: 12, FR3: 10}  # AutomaticErrorRecovery
-SETTINGS = {
-    "SetCollisionBehavior": {PANDA: 4, FR3: 3},
-    "SetLoad": {PANDA: 10, FR3: 9},
-}
+SETTINGS = {"SetCollisionBehavior": {PANDA: 4, FR3: 3}, "SetLoad": {PANDA: 10, FR3: 9}}
 
 # Modes in a state.
 CONTROLLER_TORQUE = 2
@@ -40,32 +37,15 @@ LIBFRANKA = {  # by protocol version
 
 MOVE_STATUS = {
     PANDA: (
-        "success",
-        "motion_started",
-        "preempted",
-        "not_possible",
-        "singular_start",
-        "invalid_argument",
-        "reflex",
-        "user_stop",
-        "input_error",
-        "aborted",
+        "success", "motion_started", "preempted", "not_possible", "singular_start",
+        "invalid_argument", "reflex", "user_stop", "input_error", "aborted",
     ),
     FR3: (
-        "success",
-        "motion_started",
-        "preempted",
-        "preempted_by_safety",
-        "rejected_by_safety",
-        "not_possible",
-        "singular_start",
-        "invalid_argument",
-        "reflex",
-        "user_stop",
-        "input_error",
+        "success", "motion_started", "preempted", "preempted_by_safety", "rejected_by_safety",
+        "not_possible", "singular_start", "invalid_argument", "reflex", "user_stop", "input_error",
         "aborted",
     ),
-}
+}  # fmt: skip
 STOP_STATUS = {
     PANDA: ("success", "not_possible", "user_stop", "reflex", "aborted"),
     FR3: ("success", "not_possible", "rejected_by_safety", "user_stop", "reflex", "aborted"),
@@ -73,15 +53,10 @@ STOP_STATUS = {
 RECOVER_STATUS = {
     PANDA: ("success", "not_possible", "manual_recovery", "reflex", "user_stop", "aborted"),
     FR3: (
-        "success",
-        "not_possible",
-        "rejected_by_safety",
-        "manual_recovery",
-        "reflex",
-        "user_stop",
+        "success", "not_possible", "rejected_by_safety", "manual_recovery", "reflex", "user_stop",
         "aborted",
     ),
-}
+}  # fmt: skip
 SET_STATUS = ("success", "not_possible", "invalid_argument", "rejected_by_safety")  # FR3: the last
 
 MEANING = {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import read_log
 from drivers.interface import Array, DriverError, EndOfStream, Intake, JointSample, LinkMotion
 
 _DEFAULT_PERIOD_NS = 1_000_000  # of a recording too short to say
@@ -24,11 +24,13 @@ class LogArm:
     Args:
         path: an MCAP file, see `drivers.files.mcap.read_log`.
         joint_names: joints wanted, in this order; all where None.
-        link_names: links wanted, in this order; those that the recording pairs with the joints,
-            else all, where None. `link_names` is () where the recording has no link motion.
 
     Raises:
-        DriverError: the recording cannot be read or lacks a joint or link.
+        DriverError: the recording cannot be read or lacks a joint.
+
+    Attributes:
+        link_names: those that the recording pairs with the joints, else all; () where it has no
+            link motion.
     """
 
     paced = False
@@ -37,16 +39,8 @@ class LogArm:
     arrived_ns = 0
     delay_ns = 0
 
-    def __init__(
-        self,
-        path: str | Path,
-        joint_names: Sequence[str] | None = None,
-        link_names: Sequence[str] | None = None,
-    ) -> None:
-        log = read_log(path, joint_names)
-        if link_names is not None:
-            log = log.select(log.joint_names, link_names)
-        self.log: Log = log
+    def __init__(self, path: str | Path, joint_names: Sequence[str] | None = None) -> None:
+        self.log = log = read_log(path, joint_names)
         self.warnings: list[str] = log.warnings
         self.joint_names: tuple[str, ...] = log.joint_names
         # (m,) whether a sample has link motion; None where the recording has none to give

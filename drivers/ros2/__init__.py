@@ -6,5 +6,4 @@ memory     what the two share
 holding    how a moving arm is braked and held by torques
 wire       DDS with the types and names that ROS 2 uses
 settings   what an address says
-publisher  topics of our own: estimate, load, wrench
 """

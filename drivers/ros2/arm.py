@@ -59,10 +59,7 @@ class Ros2Arm:
     link_names: tuple[str, ...] = ()
 
     def __init__(
-        self,
-        address: str,
-        joint_names: Sequence[str] | None = None,
-        allow_motion: bool = False,
+        self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
         self._settings = where = parse(address)
         names = tuple(joint_names or where.joints)
@@ -133,7 +130,7 @@ class Ros2Arm:
             self._next += behind
             self.intake.refused[Refusal.OVERTAKEN.name.lower()] += behind
             if self._driving:  # before that it only says that somebody took a while to begin
-                self._note(Refusal.OVERTAKEN)
+                self.intake.note(Refusal.OVERTAKEN.name, NOTES[Refusal.OVERTAKEN])
         stamp_ns, self.arrived_ns, values = bridge.memory.state(self._next)
         self._next += 1
         self._count(bridge, stamp_ns)
@@ -214,17 +211,13 @@ class Ros2Arm:
         for why in Refusal:
             refused = bridge.memory.words.refused[why] - self._ignored[why]
             if why != Refusal.OVERTAKEN and refused:
-                self._note(why)
+                intake.note(why.name, NOTES[why])
                 intake.refused[why.name.lower()] = refused
         intake.received = intake.used + sum(intake.refused.values())
         if self._stamp_ns:
             periods = (stamp_ns - self._stamp_ns) / self.period_ns
             intake.lost += max(math.floor(periods + 0.5) - 1, 0)
         self._stamp_ns = stamp_ns
-
-    def _note(self, why: Refusal) -> None:
-        if NOTES[why] not in self.intake.notes:
-            self.intake.notes.append(NOTES[why])
 
 
 class _Process:

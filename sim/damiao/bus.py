@@ -12,8 +12,8 @@ import time
 from collections import deque
 
 import can
-import msgpack
 from can.interfaces.udp_multicast import UdpMulticastBus
+from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
 from sim.damiao.codec import REFRESH, SERVICE_ID, data_frame
 
@@ -25,10 +25,6 @@ INTERFACES = ("udp_multicast", "socketcan")
 MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
 MULTICAST_PORT = 43113  # python-can's default port
 ASK_S = 0.2
-PACKED = (
-    *("timestamp", "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame"),
-    *("channel", "dlc", "data", "is_fd", "bitrate_switch", "error_state_indicator"),
-)
 
 
 class BoardsMulticastBus(UdpMulticastBus):
@@ -45,7 +41,7 @@ class BoardsMulticastBus(UdpMulticastBus):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame to the group. Raises can.CanOperationError."""
-        data = _packed(msg)
+        data = pack_message(msg)
         self._own.append(data)
         try:
             self._socket.sendto(data, self._to)
@@ -74,7 +70,10 @@ class BoardsMulticastBus(UdpMulticastBus):
                 while self._own.popleft() != data:
                     continue
                 continue
-            message = _unpacked(data)
+            try:
+                message = unpack_message(data, check=True)
+            except Exception as error:  # msgpack raises ValueErrors, own classes and RecursionError
+                raise can.CanOperationError("a datagram that is no frame came") from error
             if self._fd or not message.is_fd:
                 return message
 
@@ -82,20 +81,6 @@ class BoardsMulticastBus(UdpMulticastBus):
         """Leave the group."""
         self._socket.close()
         super().shutdown()
-
-
-def _packed(message: can.Message) -> bytes:
-    """A frame as python-can's buses put it into a datagram."""
-    told = {name: getattr(message, name) for name in PACKED}  # in this order
-    told |= {"timestamp": 0.0, "channel": None, "data": bytes(message.data)}
-    return bytes(msgpack.packb(told))
-
-
-def _unpacked(data: bytes) -> can.Message:
-    try:
-        return can.Message(**msgpack.unpackb(data), check=True)
-    except Exception as error:  # msgpack raises ValueErrors, own classes and RecursionError
-        raise can.CanOperationError("a datagram that is no frame came") from error
 
 
 def open_bus(

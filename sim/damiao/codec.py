@@ -93,22 +93,12 @@ def encode_feedback(
     return word.to_bytes(FRAME_BYTES, "big")
 
 
-def register_value(register: int, data: bytes) -> float | int:
-    """Value of a register's four bytes."""
-    return struct.unpack("<I" if register in INTEGER_REGISTERS else "<f", data)[0]
-
-
 def encode_register_reply(motor_id: int, what: int, register: int, value: float) -> bytes:
     """The reply to a read (`what` is READ) or the echo of a write (WRITE)."""
     head = bytes([motor_id & 0xFF, motor_id >> 8, what, register])
     if register in INTEGER_REGISTERS:
         return head + struct.pack("<I", int(value))
     return head + struct.pack("<f", value)
-
-
-def encode_save_reply(motor_id: int) -> bytes:
-    """The reply to a save; its layout is this simulator's choice, no source describes it."""
-    return bytes([motor_id & 0xFF, motor_id >> 8, SAVE, 1, 0, 0, 0, 0])
 
 
 def data_frame(reply_id: int, data: bytes, fd: bool) -> can.Message:

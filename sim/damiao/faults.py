@@ -167,10 +167,3 @@ class Outbox:
         else:
             del message.data[pick(size) :]
             message.dlc = len(message.data)
-
-
-def spiked(q: float, faults: Faults, now_s: float) -> float:
-    """An angle, or one that is far off."""
-    if faults.strikes("spike", now_s):
-        return q + (SPIKE_RAD if faults.pick(2) else -SPIKE_RAD)
-    return q

@@ -92,13 +92,14 @@ def frame_ns(message: can.Message, bitrate: int, data_bitrate: int) -> int:
 def classic_bits(identifier: int, data: bytes) -> int:
     """Bits of a classic frame, stuff bits and gap included."""
     head = identifier << 7 | len(data)  # start, id, then three dominant bits and the length
-    count, state = stuffed(head, 19, (-1, 0))
-    for byte in data:
-        more, state = stuffed(byte, 8, state)
+    parts = [(head, 19), *((byte, 8) for byte in data)]
+    crc, count, state = 0, 0, (-1, 0)
+    for bits, width in parts:
+        crc = _crc_of(bits, width, crc)
+    for bits, width in (*parts, (crc, 15)):
+        more, state = stuffed(bits, width, state)
         count += more
-    more, state = stuffed(_crc15(head, data), 15, state)
-    count += more + (state[1] == 5)
-    return 19 + 8 * len(data) + 15 + count + CLASSIC_TAIL_BITS
+    return 19 + 8 * len(data) + 15 + count + (state[1] == 5) + CLASSIC_TAIL_BITS
 
 
 def fd_bits(identifier: int, data: bytes, switch: bool) -> tuple[int, int]:
@@ -116,16 +117,9 @@ def fd_bits(identifier: int, data: bytes, switch: bool) -> tuple[int, int]:
     return (slow, fast) if switch else (slow + fast, 0)
 
 
-def _crc15(head: int, data: bytes) -> int:
-    """Checksum of a classic frame from start of frame to the last data bit."""
-    crc = _crc_of(head, 19, 0)
-    for byte in data:
-        crc = _crc_of(byte, 8, crc)
-    return crc
-
-
 @lru_cache(maxsize=1 << 18)
 def _crc_of(bits: int, width: int, crc: int) -> int:
+    """Checksum of a classic frame with `width` bits more."""
     for k in range(width - 1, -1, -1):
         invert = (bits >> k & 1) ^ (crc >> 14)
         crc = (crc << 1 & 0x7FFF) ^ (CRC15 if invert else 0)
@@ -142,17 +136,16 @@ class Node(Protocol):
         """When it sends unasked; None for never."""
 
 
-def refuse() -> can.CanOperationError:
-    """What socketcan raises where the controller's queue is full."""
-    return can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
-
-
 class LineEnd(can.BusABC):
-    """One end of a line."""
+    """One end of a line.
+
+    Attributes:
+        arrived: frames that are complete and were not received yet.
+    """
 
     def __init__(self, line: Line, name: str, fd: bool) -> None:
         """Belongs to a line, which makes both."""
-        self._line, self._arrived = line, deque[can.Message]()
+        self._line, self.arrived = line, deque[can.Message]()
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self.channel_info = f"simulated CAN line, end of the {name}"
         super().__init__(channel=name)
@@ -163,22 +156,13 @@ class LineEnd(can.BusABC):
 
     def recv(self, timeout: float | None = 0.0) -> can.Message | None:
         """The oldest frame that has arrived; lets virtual time pass up to `timeout` s for one."""
-        if not self._arrived:
+        if not self.arrived:
             self._line.wait(self, round((timeout or 0.0) * 1e9))
-        while self._arrived:
-            message = self._arrived.popleft()
+        while self.arrived:
+            message = self.arrived.popleft()
             if self._matches_filters(message):
                 return message
         return None
-
-    def arrive(self, message: can.Message) -> None:
-        """A frame for this end is complete."""
-        self._arrived.append(message)
-
-    @property
-    def waiting(self) -> int:
-        """Frames that have arrived and were not received yet."""
-        return len(self._arrived)
 
 
 class Line:
@@ -188,14 +172,9 @@ class Line:
         host: the host's end.
         boards: the motors' end.
         start_ns: the clock's first reading.
-        busy_ns: how long frames have occupied the wire so far.
     """
 
-    def __init__(
-        self,
-        fd: bool = True,
-        faults: Faults | None = None,
-    ) -> None:
+    def __init__(self, fd: bool = True, faults: Faults | None = None) -> None:
         """Lay the line.
 
         Args:
@@ -203,7 +182,7 @@ class Line:
             faults: the boards' own; `enobufs` strikes the host's sends.
         """
         self.host, self.boards = LineEnd(self, "host", fd), LineEnd(self, "motors", fd)
-        self.start_ns, self.busy_ns = START_NS, 0
+        self.start_ns = START_NS
         self._fd, self._faults = fd, faults
         self._now_ns = self._free_ns = START_NS
         self._node: Node | None = None
@@ -243,9 +222,9 @@ class Line:
         While the line is eager also until the last frame under way has arrived.
         """
         if self._eager and end is self.host:
-            while not end.waiting and self._next_event() < FAR_NS:
+            while not end.arrived and self._next_event() < FAR_NS:
                 self._run(self._next_event(), end)
-        if for_ns and not end.waiting:
+        if for_ns and not end.arrived:
             self._run(self._now_ns + for_ns, end)
 
     def queue(self, end: LineEnd, message: can.Message) -> None:
@@ -260,13 +239,14 @@ class Line:
         since_s = (self._now_ns - self.start_ns) * 1e-9
         struck = self._faults is not None and self._faults.strikes("enobufs", since_s)
         if struck or len(self._from_host) >= HOST_QUEUE:
-            raise refuse()
+            no_room = "Failed to transmit: No buffer space available"  # as socketcan has it
+            raise can.CanOperationError(no_room, errno.ENOBUFS)
         own = copy(message)  # the host may change what it sent
         own.is_rx = True
         self._from_host.append((self._now_ns, own))
 
     def _run(self, until_ns: int, awaited: LineEnd | None) -> None:
-        while awaited is None or not awaited.waiting:
+        while awaited is None or not awaited.arrived:
             if self._flying is not None:
                 if self._flying[0] > until_ns:
                     break
@@ -311,7 +291,6 @@ class Line:
             message, to = waiting.pop(index)[3], self.host
             heapq.heapify(waiting)
         took = frame_ns(message, BITRATE, DATA_BITRATE)
-        self.busy_ns += took
         self._flying = now + took, to, message
 
     def _land(self, end_ns: int, to: LineEnd, message: can.Message) -> None:
@@ -319,6 +298,6 @@ class Line:
         self._flying = None
         self._now_ns = self._free_ns = end_ns
         message.timestamp = end_ns * 1e-9  # of the frame's end
-        to.arrive(message)
+        to.arrived.append(message)
         if to is self.boards and self._node is not None:
             self._node.service()

@@ -13,14 +13,7 @@ import math
 from dataclasses import dataclass
 
 from drivers.errors import choices
-from sim.damiao.codec import (
-    AT_REST,
-    INTEGER_REGISTERS,
-    FullScale,
-    MitCommand,
-    decode_command,
-    encode_feedback,
-)
+from sim.damiao.codec import AT_REST, INTEGER_REGISTERS, FullScale, decode_command, encode_feedback
 
 DISABLED, ENABLED = 0x0, 0x1
 OVER_VOLTAGE, UNDER_VOLTAGE, OVER_CURRENT = 0x8, 0x9, 0xA
@@ -35,7 +28,7 @@ TIMEOUT_UNIT_NS = 50_000  # one of two opinions on register 9; the other is 1 ms
 MIT_MODE = 1
 MODES = (1, 2, 3, 4)
 MAX_STANDARD_ID = 0x7FF
-CODE_1M, CODE_5M = 4, 9  # of CAN_BR
+CODE_5M = 9  # of CAN_BR
 # Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
 AIR_C = 25.0
 ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
@@ -195,11 +188,6 @@ class Motor:
         elif register == TIMEOUT:
             self._limit_ns = int(value) * TIMEOUT_UNIT_NS if value else NEVER_NS
             self.deadline_ns = NEVER_NS
-
-
-def in_joint_angles(command: MitCommand, zero: float) -> MitCommand:
-    """The command of a motor whose angle is 0 at the joint angle `zero`."""
-    return command._replace(q_des=command.q_des + zero)
 
 
 def _fits(register: int, value: float) -> bool:

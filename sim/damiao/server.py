@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -18,9 +19,8 @@ from sim.damiao import codec, motor
 from sim.damiao.arm import World
 from sim.damiao.bus import address_of, check_alone, open_bus
 from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
-from sim.damiao.faults import HOT_C, JUMP_RAD, STATUS, Faults, Outbox, spiked
-from sim.damiao.motor import Motor, in_joint_angles, motor_set
-from sim.damiao.options import check
+from sim.damiao.faults import HOT_C, JUMP_RAD, SPIKE_RAD, STATUS, Faults, Outbox
+from sim.damiao.motor import Motor, motor_set
 from sim.effects import ENCODER, TORQUE
 from sim.ending import Ending, sum_up
 from sim.engine import DriveLaw
@@ -85,9 +85,9 @@ class MotorBank:
                 tau = self._world.at(start_ns, j)[2] if unit.drives else 0.0
                 unit.warm_up(tau, WARM_UP_TICKS * 1e-3)
             if unit.drives:
-                q_des, dq_des, kp, kd, ff = in_joint_angles(unit.command, unit.zero)
+                q_des, dq_des, kp, kd, ff = unit.command
                 most = min(unit.scale.tmax, unit.kind.scale.tmax)  # its scale's, or its strength
-                rows[:, j] = q_des, dq_des, kp, kd, reached[j], ff, most
+                rows[:, j] = q_des + unit.zero, dq_des, kp, kd, reached[j], ff, most
         return DriveLaw(*rows)
 
     def _index(self) -> None:
@@ -127,13 +127,15 @@ class MotorBank:
             return self._feedback(j, now_ns, now_s)
         if what == codec.SAVE:
             self.frames["save"] += 1
-            return codec.encode_save_reply(unit.motor_id)
+            # The layout is this simulator's choice, no source describes it.
+            return bytes([unit.motor_id & 0xFF, unit.motor_id >> 8, what, 1, 0, 0, 0, 0])
         if what not in (codec.READ, codec.WRITE):
             self.frames["unknown service"] += 1
             return None
         self.frames["register reads" if what == codec.READ else "register writes"] += 1
         if what == codec.WRITE:
-            unit.write(register, codec.register_value(register, data[4:]))
+            kind = "<I" if register in codec.INTEGER_REGISTERS else "<f"
+            unit.write(register, struct.unpack(kind, data[4:])[0])
             self._index()
         value = unit.read(register, self._world.at(now_ns, j)[0])
         if value is None:
@@ -150,7 +152,8 @@ class MotorBank:
                 q, dq = self._told.setdefault(j, (q, 0.0))
             if faults.hits("jump", number, now_s):
                 q += JUMP_RAD
-            q = spiked(q, faults, now_s)
+            if faults.strikes("spike", now_s):
+                q += SPIKE_RAD if faults.pick(2) else -SPIKE_RAD
             if unit.status <= motor.ENABLED:
                 self._fail(unit, number, now_s)
         return unit.feedback(q, dq, tau)
@@ -373,7 +376,6 @@ class Boards:
 
 def run(args: argparse.Namespace) -> int:
     """`adapter sim can`: serve until a signal comes or the time is over. Raises ValueError."""
-    check(args)
     options = options_of(args.set)
     scenario = build(args.scenario, args.seed, **options)
     noise = scenario.noise if options.keys() & {"noise", "levels"} else None

@@ -19,14 +19,15 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import pybullet as bullet
 
-from sim.falls.fall import BANDWIDTH, DAMPING, RATE_HZ, Babbling, FallRecord, babble
-from sim.falls.tree_truth import TreeTruth, atlas
+from sim.falls import fall
+from sim.falls.fall import RATE_HZ, FallRecord, babble
+from sim.falls.tree_truth import TreeLimits, TreeTruth, atlas
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
@@ -40,6 +41,7 @@ UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 SHUTDOWN_S = 10.0  # that a worker has left once it is asked to end
 MOTION, NOISE = 1, 2  # streams of random numbers
 
+# What the sensors add; all noise is white and Gaussian, of units up to half the sample rate.
 STANDARD_GRAVITY = 9.80665  # m/s² per g, exact by definition (CGPM 1901)
 ENCODER_STEP = 2 * np.pi / 2**19  # rad; 19 bits, usual for magnetic absolute encoders on joints
 # rad rms, our choice: with the quantisation it makes the differentiated position as noisy
@@ -52,40 +54,7 @@ GYRO_DENSITY = np.radians(0.007)  # rad/s/√Hz; MEMS unit Xsens MTi-1, data she
 ACCEL_DENSITY = 120e-6 * STANDARD_GRAVITY  # m/s²/√Hz; the same unit, 120 µg/√Hz
 
 
-@dataclass(frozen=True, slots=True)
-class TreeNoise:
-    """Sizes of what the sensors add; all noise is white and Gaussian.
-
-    Attributes:
-        encoder_step: quantisation of joint positions, rad; 0 for none.
-        encoder_noise: added before it, rad rms.
-        torque_share: torque noise as share of a joint's effort limit, rms.
-        gyro_density: noise of angular velocities, rad/s/√Hz, up to half the sample rate.
-        accel_density: noise of accelerations, m/s²/√Hz, likewise.
-
-    Raises:
-        ValueError: a size that is negative or not a number.
-    """
-
-    encoder_step: float = ENCODER_STEP
-    encoder_noise: float = ENCODER_NOISE
-    torque_share: float = TORQUE_SHARE
-    gyro_density: float = GYRO_DENSITY
-    accel_density: float = ACCEL_DENSITY
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            if not (getattr(self, item.name) >= 0.0 and np.isfinite(getattr(self, item.name))):
-                raise ValueError(f"noise {item.name!r} must be 0 or more and finite")
-
-
-def measured(
-    truth: TreeTruth,
-    record: FallRecord,
-    noise: TreeNoise,
-    rate_hz: float,
-    rng: np.random.Generator,
-) -> dict[str, Array]:
+def measured(truth: TreeTruth, record: FallRecord, rng: np.random.Generator) -> dict[str, Array]:
     """Signals as they are measured, by name: of encoders, torque sensors, a unit on each body.
 
     Nothing measures accelerations of joints, angular accelerations or the velocity of a frame:
@@ -93,9 +62,7 @@ def measured(
 
     Args:
         truth: of the tree.
-        record: exact samples at `rate_hz`.
-        noise: sizes of what is added.
-        rate_hz: of the samples.
+        record: exact samples.
         rng: all that is random comes from it.
 
     Returns:
@@ -105,30 +72,23 @@ def measured(
     """
     links = record.links(truth)
     # The reading before the first sample too: a step of the simulator ends with q = q' + h dq.
-    before = record.q[:1] - record.dq[:1] / rate_hz
-    read = _read(np.concatenate((before, record.q)), noise, rng)
-    gyro, accel = (d * np.sqrt(rate_hz / 2) for d in (noise.gyro_density, noise.accel_density))
+    before = record.q[:1] - record.dq[:1] / RATE_HZ
+    gyro, accel = (d * np.sqrt(RATE_HZ / 2) for d in (GYRO_DENSITY, ACCEL_DENSITY))
 
     def noisy(x: Array, size: float | Array) -> Array:
         return x + size * rng.standard_normal(x.shape)
 
+    turned = noisy(np.concatenate((before, record.q)), ENCODER_NOISE)
+    read = np.round(turned / ENCODER_STEP) * ENCODER_STEP
     return {
         "q": read[1:],
-        "dq": np.diff(read, axis=0) * rate_hz,
-        "tau": noisy(record.tau, noise.torque_share * truth.limits.effort),
+        "dq": np.diff(read, axis=0) * RATE_HZ,
+        "tau": noisy(record.tau, TORQUE_SHARE * truth.limits.effort),
         "base_w": noisy(record.base_w, gyro),
         "base_a": noisy(record.base_a, accel),
         "link_w": noisy(links.w, gyro),
         "link_a": noisy(links.a, accel),
     }
-
-
-def _read(q: Array, noise: TreeNoise, rng: np.random.Generator) -> Array:
-    """What the encoders give for positions q (m, n)."""
-    q = q + noise.encoder_noise * rng.standard_normal(q.shape)
-    if noise.encoder_step == 0.0:
-        return q
-    return np.asarray(np.round(q / noise.encoder_step) * noise.encoder_step)
 
 
 @dataclass(frozen=True)
@@ -137,21 +97,17 @@ class Flight:
 
     Attributes:
         seconds: length of a trajectory.
-        rate_hz: of simulation and samples.
         seed: of motion and noise.
-        babbling: how the robot moves.
 
     Raises:
         ValueError: less than one sample, or a seed below 0.
     """
 
     seconds: float = SECONDS
-    rate_hz: float = RATE_HZ
     seed: int = 0
-    babbling: Babbling = field(default_factory=Babbling)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.seconds * self.rate_hz < np.inf:
+        if not 1 <= self.seconds * RATE_HZ < np.inf:
             raise ValueError("seconds * rate_hz must be 1 or more")
         if self.seed < 0:
             raise ValueError(f"seed must be 0 or more, got {self.seed}")
@@ -168,9 +124,8 @@ class _Job:
 
     def make(self) -> FallRecord:
         """Simulate the trajectory and write its file."""
-        how = self.flight
-        rng = np.random.default_rng([how.seed, MOTION, self.number])
-        record = babble(self.truth, how.seconds, rng, how.babbling, how.rate_hz)
+        rng = np.random.default_rng([self.flight.seed, MOTION, self.number])
+        record = babble(self.truth, self.flight.seconds, rng)
         handle, name = tempfile.mkstemp(dir=self.path.parent, suffix=PART)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -183,7 +138,7 @@ class _Job:
 
     def check(self, record: FallRecord) -> None:
         """Raises ValueError where a record is not of this job's length and tree."""
-        rows = round(self.flight.seconds * self.flight.rate_hz)
+        rows = round(self.flight.seconds * RATE_HZ)
         joints = {"q", "dq", "ddq", "tau"}
         for key in SIGNALS:
             wanted = rows, self.truth.n if key in joints else 3
@@ -201,13 +156,13 @@ class FallData:
     Attributes:
         truth: the tree.
         folder: where the files are.
-        noise: what the sensors add; None for none.
+        noise: whether items are what sensors measure.
         jobs: what decides each trajectory, and the path of its file.
     """
 
     truth: TreeTruth
     folder: Path
-    noise: TreeNoise | None
+    noise: bool
     jobs: tuple[_Job, ...]
 
     def __len__(self) -> int:
@@ -218,11 +173,11 @@ class FallData:
 
     def __getitem__(self, k: int) -> dict[str, Array]:
         record = self.exact(k)
-        if self.noise is None:
+        if not self.noise:
             return {key: getattr(record, key) for key in SIGNALS}
         job = self.jobs[k]
         rng = np.random.default_rng([job.flight.seed, NOISE, job.number])
-        return measured(self.truth, record, self.noise, job.flight.rate_hz, rng)
+        return measured(self.truth, record, rng)
 
     def exact(self, k: int) -> FallRecord:
         """Trajectory k without noise; made again if its file cannot be read."""
@@ -241,7 +196,7 @@ def data_set(
     trajectories: int = TRAJECTORIES,
     flight: Flight = Flight(),
     folder: str | Path | None = None,
-    noise: bool | TreeNoise = False,
+    noise: bool = False,
     processes: int = 2,
 ) -> FallData:
     """Trajectories of a robot that falls and babbles; those that are not there yet are made.
@@ -251,7 +206,7 @@ def data_set(
         trajectories: how many; a longer set begins with the same ones.
         flight: how it falls.
         folder: for the files; `cache_folder()` where None.
-        noise: whether items are what sensors measure, or what those sensors add.
+        noise: whether items are what sensors measure.
         processes: at work at once; of no influence on the data.
 
     Raises:
@@ -271,14 +226,13 @@ def data_set(
         with contextlib.suppress(FileNotFoundError):
             if time.time() - left.stat().st_mtime > ABANDONED_S:
                 left.unlink()
-    levels = (TreeNoise() if noise else None) if isinstance(noise, bool) else noise
     key = _key(robot, flight)
     jobs = tuple(
         _Job(robot, k, flight, place / f"{robot.name}_{k:04d}_{key}.npz")
         for k in range(trajectories)
     )
     _make([job for job in jobs if not _sound(job.path)], processes)
-    return FallData(robot, place, levels, jobs)
+    return FallData(robot, place, noise, jobs)
 
 
 def cache_folder() -> Path:
@@ -295,11 +249,19 @@ def _key(truth: TreeTruth, flight: Flight) -> str:
         "format": FORMAT,
         "simulator": bullet.getAPIVersion(),
         "tree": [truth.parent, *(x.tolist() for x in (truth.R, truth.p, truth.theta))],
-        "limits": truth.as_dict()["limits"],
+        "limits": {k: getattr(truth.limits, k).tolist() for k in TreeLimits.__slots__},
         "gravity": truth.gravity.tolist(),
-        "feedback": [BANDWIDTH, DAMPING],
-        "babbling": asdict(flight.babbling),
-        "run": [flight.seconds, flight.rate_hz, flight.seed],
+        "feedback": [fall.BANDWIDTH, fall.DAMPING],
+        "babbling": {
+            "sines": fall.SINES,
+            "low_hz": fall.LOW_HZ,
+            "high_hz": fall.HIGH_HZ,
+            "share": fall.RANGE_SHARE,
+            "top_speed": fall.TOP_SPEED,
+            "speed_share": fall.SPEED_SHARE,
+            "tumble": fall.TUMBLE,
+        },
+        "run": [flight.seconds, RATE_HZ, flight.seed],
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 

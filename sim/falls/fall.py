@@ -23,74 +23,44 @@ from sim.rigid_bodies import disconnect, load_urdf
 from sim.truth import Array, body_of
 from sim.urdf_writer import joint_text, link_text, principal
 
-RATE_HZ = 1000.0
+RATE_HZ = 1000.0  # of simulation, controller and samples
 PUSH = 1.0  # N m, by which the controller's designer feels a joint's inertia
 BANDWIDTH = 2 * np.pi * 15.0  # rad/s, of the feedback on a joint whose neighbours are free
 DAMPING = 1.0  # ratio, likewise
+# A robot babbles: each joint follows a sum of sines of its own about its middle. Slow and smooth on
+# purpose: a pure-feedback controller can follow it, joints of a humanoid use most of their range at
+# up to the top speed, and torques come from the motion of limbs and not from jerks at joints.
+SINES = 3  # per joint
+LOW_HZ, HIGH_HZ = 0.15, 0.75  # a joint's frequencies are spread evenly over the band
+RANGE_SHARE = 0.8  # of the joint's range, spanned at most; the rest is for the controller's error
+# rad/s, and share of the joint's own limit; its motion gets smaller where it would be faster
+TOP_SPEED, SPEED_SHARE = 4.0, 0.5
+TUMBLE = 0.3  # rms angular velocity of the base at the start, rad/s per axis
 
 
-@dataclass(frozen=True, slots=True)
-class Babbling:
-    """How a robot babbles: each joint follows a sum of sines of its own about its middle.
-
-    Slow and smooth on purpose: a pure-feedback controller can follow it, joints of a humanoid
-    use most of their range at up to `top_speed`, and torques come from the motion of limbs and
-    not from jerks at joints.
-
-    Attributes:
-        sines: per joint.
-        low_hz: lowest frequency; a joint's frequencies are spread evenly over the band.
-        high_hz: highest frequency.
-        share: of the joint's range that the wanted motion spans at most; the rest is left for the
-            controller's error.
-        top_speed: of a joint, rad/s; its motion gets smaller where it would be faster.
-        speed_share: of the joint's own speed limit, likewise.
-        tumble: rms angular velocity of the base at the start, rad/s per axis.
-    """
-
-    sines: int = 3
-    low_hz: float = 0.15
-    high_hz: float = 0.75
-    share: float = 0.8
-    top_speed: float = 4.0
-    speed_share: float = 0.5
-    tumble: float = 0.3
-
-    def __post_init__(self) -> None:
-        if self.sines < 1 or not 0 < self.low_hz <= self.high_hz:
-            raise ValueError("babbling needs a sine or more and 0 < low_hz <= high_hz")
-        if not (0 < self.share <= 1 and 0 < self.speed_share <= 1 and self.top_speed > 0):
-            raise ValueError("share and speed_share must be in (0, 1], top_speed above 0")
-        if not self.tumble >= 0:
-            raise ValueError(f"tumble must be 0 or more, got {self.tumble}")
-
-
-def plan(
-    limits: TreeLimits, t: Array, settings: Babbling, rng: np.random.Generator
-) -> tuple[Array, Array]:
+def plan(limits: TreeLimits, t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Wanted positions and velocities of all joints.
 
     Args:
         limits: of n joints.
         t: (m,) s.
-        settings: of the motion.
         rng: all that is random comes from it.
 
     Returns:
         q (m, n) rad inside the limits and dq (m, n) rad/s.
     """
     n = len(limits.lower)
-    edges = np.linspace(settings.low_hz, settings.high_hz, settings.sines + 1)[:, None]
-    rate = 2 * np.pi * (edges[:-1] + (edges[1:] - edges[:-1]) * rng.random((settings.sines, n)))
-    phase = rng.uniform(0, 2 * np.pi, (settings.sines, n))
-    size = rng.uniform(0.5, 1.0, (settings.sines, n)) * rate.min(axis=0) / rate
+    edges = np.linspace(LOW_HZ, HIGH_HZ, SINES + 1)[:, None]
+    rate = 2 * np.pi * (edges[:-1] + (edges[1:] - edges[:-1]) * rng.random((SINES, n)))
+    phase = rng.uniform(0, 2 * np.pi, (SINES, n))
+    size = rng.uniform(0.5, 1.0, (SINES, n)) * rate.min(axis=0) / rate
     q, dq = np.zeros((len(t), n)), np.zeros((len(t), n))
     for a, w, f in zip(size, rate, phase, strict=True):
         angle = np.outer(t, w) + f
         q += a * np.sin(angle)
         dq += a * w * np.cos(angle)
-    half = settings.share * (limits.upper - limits.lower) / 2
-    fastest = np.minimum(settings.top_speed, settings.speed_share * limits.velocity)
+    half = RANGE_SHARE * (limits.upper - limits.lower) / 2
+    fastest = np.minimum(TOP_SPEED, SPEED_SHARE * limits.velocity)
     scale = np.minimum(half / np.abs(q).max(axis=0), fastest / np.abs(dq).max(axis=0))
     return (limits.lower + limits.upper) / 2 + scale * q, scale * dq
 
@@ -154,16 +124,10 @@ def _link_motions(frames: Frames, base: Array, q: Array, dq: Array, ddq: Array) 
 class FreeFall:
     """A tree that falls: knows how to be put somewhere and to move on by one step."""
 
-    def __init__(self, truth: TreeTruth, rate_hz: float = RATE_HZ) -> None:
-        """Load the tree.
-
-        Raises:
-            ValueError: a rate that is not above 0.
-        """
-        if not rate_hz > 0:
-            raise ValueError(f"rate_hz must be above 0, got {rate_hz}")
+    def __init__(self, truth: TreeTruth) -> None:
+        """Load the tree."""
         self.truth = truth
-        self.h_s = 1.0 / rate_hz
+        self.h_s = 1.0 / RATE_HZ
         self._world = bullet.connect(bullet.DIRECT)
         self._close = weakref.finalize(self, disconnect, [self._world])
         self._robot = load_urdf(_urdf(truth), self._world, fixed=False)
@@ -265,13 +229,7 @@ class FreeFall:
         self._close()
 
 
-def babble(
-    truth: TreeTruth,
-    seconds: float,
-    rng: np.random.Generator,
-    settings: Babbling | None = None,
-    rate_hz: float = RATE_HZ,
-) -> FallRecord:
+def babble(truth: TreeTruth, seconds: float, rng: np.random.Generator) -> FallRecord:
     """Let a tree fall for a while and babble, its joints under pure feedback.
 
     Torques are those of a position and velocity feedback on the wanted motion, cut at the joints'
@@ -281,17 +239,14 @@ def babble(
         truth: the tree.
         seconds: how long.
         rng: all that is random comes from it.
-        settings: of the babbling.
-        rate_hz: of simulation, controller and samples.
 
     Raises:
         RuntimeError: a joint left its range, or the simulation diverged.
     """
-    settings = settings or Babbling()
-    m = round(seconds * rate_hz)
-    want_q, want_dq = plan(truth.limits, np.arange(m) / rate_hz, settings, rng)
-    tumble = settings.tumble * rng.standard_normal(3)
-    fall = FreeFall(truth, rate_hz)
+    m = round(seconds * RATE_HZ)
+    want_q, want_dq = plan(truth.limits, np.arange(m) / RATE_HZ, rng)
+    tumble = TUMBLE * rng.standard_normal(3)
+    fall = FreeFall(truth)
     try:
         felt = fall.felt_inertia()
         stiff, damp = BANDWIDTH**2 * felt, 2 * DAMPING * BANDWIDTH * felt

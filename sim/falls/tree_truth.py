@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -74,25 +73,6 @@ class TreeTruth:
     def lam(self) -> Array:
         """λ (n, 6), see `lam_of`."""
         return lam_of(self.R, self.p)
-
-    @property
-    def mass(self) -> float:
-        """Of the whole robot, kg."""
-        return float(self.theta[:, 0].sum())
-
-    def as_dict(self) -> dict[str, Any]:
-        """The truth as plain numbers; keys of a truth file, and the tree's own."""
-        return {
-            "robot": self.name,
-            "base": self.base_name,
-            "joints": list(self.joint_names),
-            "links": list(self.link_names),
-            "parent": list(self.parent),
-            "lambda": self.lam.tolist(),
-            "theta": self.theta.tolist(),
-            "limits": {k: getattr(self.limits, k).tolist() for k in TreeLimits.__slots__},
-            "gravity": self.gravity.tolist(),
-        }
 
 
 def atlas() -> TreeTruth:

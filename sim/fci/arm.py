@@ -6,15 +6,15 @@ import numpy as np
 
 from drivers.interface import DriverError, JointSample
 from sim.compiled import compiled
-from sim.dynamics import cross, end_effector, mass_matrix, torques
+from sim.dynamics import cross, end_effector
 from sim.effects import payload
 from sim.fci.cartesian import difference, impedance, posture
 from sim.fci.codec import TICK_S
 from sim.fci.settings import Settings
 from sim.plant import Plant
 from sim.rigid_bodies import payload_theta
-from sim.scenarios import FLANGE_M, Scenario
-from sim.truth import Array, Truth
+from sim.scenarios import Scenario
+from sim.truth import FLANGE, Array
 
 SERVED_SUBSTEPS = 2  # of 0.5 ms: friction in four takes most of a millisecond on a slow machine
 EXTERNAL_HZ = 10.0  # low pass of the external torque; the robot's own is not published
@@ -22,8 +22,6 @@ EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * EXTERNAL_HZ * TICK_S)
 # The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
 # is what a command per millisecond holds stable on a rigid arm.
 FASTEST_RATE = 60.0  # 1/s
-FLANGE = np.eye(4)  # in the last link's frame
-FLANGE[2, 3] = FLANGE_M
 SINGULAR = 0.01  # manipulability (m³, Yoshikawa) below which no wrench is told; 0.08 when ready
 
 
@@ -44,7 +42,7 @@ class Arm:
 
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         self.truth = scenario.truth.with_changes(effects=())  # all that the robot knows
-        self._motors = motor_inertias(scenario.truth)
+        self._motors = scenario.truth.motor_inertia
         self._plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
         self._n = self.truth.n
         self._still = np.zeros(self._n)
@@ -73,10 +71,11 @@ class Arm:
     def refresh(self, settings: Settings) -> None:
         """Take over what a client set: end effector, stiffness frame and load."""
         self._tool, self._to_K = FLANGE @ settings.F_T_EE, settings.EE_T_K
-        self._theta = self.truth.theta.copy()
+        theta = self.truth.theta.copy()
         m, com, inertia = settings.load
         if m > 0.0:
-            self._theta[-1] += payload_theta(payload(m, FLANGE[:3, 3] + com, inertia))
+            theta[-1] += payload_theta(payload(m, FLANGE[:3, 3] + com, inertia))
+        self._loaded = self.truth.with_changes(theta=theta)
 
     def drive(self, tau: Array) -> None:
         """Torques on top of gravity, reached at the end of the next tick; brakes open."""
@@ -138,13 +137,11 @@ class Arm:
 
     def model(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (7,) of the internal model for a motion, N m."""
-        truth = self.truth
-        rigid = torques(truth.frames, self._theta, truth.base, q, dq, ddq)
-        return np.asarray(rigid + self._motors * ddq)
+        return np.asarray(self._loaded.torques(q, dq, ddq) + self._motors * ddq)
 
     def mass(self, q: Array) -> Array:
         """(7, 7) mass matrix of the internal model, kg m²."""
-        M = np.asarray(mass_matrix(self.truth.frames, self._theta, q))
+        M = self._loaded.mass_matrix(q)
         M.flat[:: self._n + 1] += self._motors
         return M
 
@@ -172,15 +169,6 @@ class Arm:
         """Pose and external wrench at the present posture."""
         self.pose, self.jacobian = self.frame(self.q)
         self.wrench = wrench_at(self.pose, self.jacobian, self._to_K, self.tau_external, SINGULAR)
-
-
-def motor_inertias(truth: Truth) -> Array:
-    """(n,) kg m² that the motors add to the joints at all times."""
-    found = np.zeros(truth.n)
-    for effect in truth.effects:
-        if effect.name == "motor_inertia" and effect.interval_s is None:
-            found[effect.columns(truth.n)] += effect.number("B")
-    return found
 
 
 @compiled

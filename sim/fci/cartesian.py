@@ -20,11 +20,6 @@ REACHED = 1e-3  # m and rad, so far the joints may be from a pose; else it is ou
 RIGID = 1e-4  # so far R^T R of a pose may be from the identity
 ELBOW_SPEED = 2.175  # rad/s (Franka FCI documentation)
 
-START = "cartesian_position_motion_generator_start_pose_invalid"
-FRAME = "cartesian_position_motion_generator_invalid_frame_flag"
-VELOCITY = "cartesian_motion_generator_velocity_limits_violation"
-ACCELERATION = "cartesian_motion_generator_velocity_discontinuity"
-JERK = "cartesian_motion_generator_acceleration_discontinuity"
 START_ELBOW = "cartesian_motion_generator_start_elbow_invalid"
 START_SIGN = "start_elbow_sign_inconsistent"
 SIGN = "cartesian_motion_generator_elbow_sign_inconsistent"
@@ -94,10 +89,10 @@ class CartesianMotion:
             return self._go(moved(self.pose, command.twist), command.twist.copy(), elbow)
         pose = command.pose.reshape(4, 4).T
         if not rigid(pose):
-            return FRAME
+            return "cartesian_position_motion_generator_invalid_frame_flag"
         step = difference(self.pose, pose)
         if self._fresh and not (np.abs(step) <= START_TOLERANCE).all():
-            return START
+            return "cartesian_position_motion_generator_start_pose_invalid"
         return self._go(pose.copy(), step / TICK_S, elbow)
 
     def extrapolate(self) -> None:
@@ -127,9 +122,9 @@ class CartesianMotion:
         jerk = (acceleration - self.acceleration) / TICK_S
         hand = self._hand
         for value, most, error in (
-            (twist, hand.speed, VELOCITY),
-            (acceleration, hand.acceleration, ACCELERATION),
-            (jerk, hand.jerk, JERK),
+            (twist, hand.speed, "cartesian_motion_generator_velocity_limits_violation"),
+            (acceleration, hand.acceleration, "cartesian_motion_generator_velocity_discontinuity"),
+            (jerk, hand.jerk, "cartesian_motion_generator_acceleration_discontinuity"),
         ):
             if not within(value, most):
                 return error

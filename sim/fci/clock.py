@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import os
 import time
@@ -12,20 +11,12 @@ from contextlib import ExitStack, contextmanager, suppress
 PERIOD_NS = 1_000_000
 ANSWER_NS = 500_000  # a client's own part of a period (Franka FCI documentation)
 SPIN_NS = 60_000  # waiting actively for the last part: a wake-up costs the system that much
-ABSOLUTE = 1  # TIMER_ABSTIME, <time.h>
 PRIORITY = 80  # of SCHED_FIFO: above any client loop but those that take 99
-
-_libc = ctypes.CDLL(None, use_errno=True)
-
-
-class _Moment(ctypes.Structure):
-    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
 def _sleep_to(deadline_ns: int) -> None:
-    """Sleep until CLOCK_MONOTONIC shows the deadline, or a signal comes."""
-    moment = _Moment(*divmod(deadline_ns, 1_000_000_000))
-    _libc.clock_nanosleep(time.CLOCK_MONOTONIC, ABSOLUTE, ctypes.byref(moment), None)
+    """Sleep until CLOCK_MONOTONIC shows the deadline."""
+    time.sleep(max(1e-9 * (deadline_ns - time.monotonic_ns()), 0.0))
 
 
 class Ticks:
@@ -36,9 +27,7 @@ class Ticks:
     """
 
     def __init__(
-        self,
-        now: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[int], None] = _sleep_to,
+        self, now: Callable[[], int] = time.monotonic_ns, sleep: Callable[[int], None] = _sleep_to
     ) -> None:
         self._now, self._sleep = now, sleep
         self._due = self._slipped = 0

@@ -24,8 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.scenarios import FLANGE_M
-from sim.truth import Truth, body_of
+from sim.truth import FLANGE_M, Truth, body_of
 from sim.urdf_writer import joint_text, limit_text, link_text
 
 _HEAD = """#include <math.h>
@@ -54,13 +53,10 @@ def _table(name: str, values: Iterable[float]) -> str:
 
 def _frames() -> list[str]:
     """The functions that differ only in the frame; the first joint's Jacobians take no posture."""
-    out = []
+    out = ["static const double ZERO[N];\n"]
     for k in range(1, 10):
         tool, given = ("tool", "const double *tool, ") if k == 9 else ("0", "")
-        q, posture = ("0", "") if k == 1 else ("q", "const double *q, ")
-        if k == 1:
-            out.append("static const double ZERO[N];\n")
-            q = "ZERO"
+        q, posture = ("ZERO", "") if k == 1 else ("q", "const double *q, ")
         count = min(k, 8)
         for name, body in (("Ji_J_J", 1), ("O_J_J", 0)):
             call = f"jacobian({q}, {count}, {tool}, {body}, out)"

@@ -12,7 +12,6 @@ from sim.truth import Array, Limits
 
 START_TOLERANCE = 1e-3  # rad, first position from q_d; the robot's own is not published
 
-START_POSE = "joint_position_motion_generator_start_pose_invalid"
 BROKEN = LimitErrors(
     "joint_motion_generator_position_limits_violation",
     "joint_motion_generator_velocity_limits_violation",
@@ -27,8 +26,6 @@ FIRST_COMMAND_TICKS = 200
 # N m from one tick to the next; the margin is the rounding of an f32 tau_J_d near 87 N m.
 TORQUE_STEP, ROUNDING = 1.0, 1e-5
 COMMUNICATION = "communication_constraints_violation"
-TORQUE_JUMP = "controller_torque_discontinuity"
-JOINT_GENERATORS = (Generator.JOINT_POSITION, Generator.JOINT_VELOCITY)
 CARTESIAN_GENERATORS = (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY)
 
 
@@ -48,7 +45,7 @@ class DesiredMotion:
         q, dq = command.q, command.dq
         if self._kind == Generator.JOINT_POSITION:
             if self._fresh and not (np.abs(q - self.q) <= START_TOLERANCE).all():
-                return START_POSE
+                return "joint_position_motion_generator_start_pose_invalid"
             return self._go(q.copy(), (q - self.q) / TICK_S)
         return self._go(self.q + dq * TICK_S, dq.copy())
 
@@ -73,8 +70,7 @@ def allowed(controller: int, generator: int, version: int) -> bool:
     """Whether this robot makes such a motion."""
     if (controller, generator) == (ControllerMode.EXTERNAL, Generator.NONE):
         return version == 10
-    possible = JOINT_GENERATORS + CARTESIAN_GENERATORS
-    return controller in tuple(ControllerMode)[: ControllerMode.OTHER] and generator in possible
+    return 0 <= controller < ControllerMode.OTHER and 0 <= generator < Generator.NONE
 
 
 class CommandedMotion:
@@ -129,7 +125,7 @@ class CommandedMotion:
         self._missed = 0
         if self.by_torque:
             if not (np.abs(command.tau - self.tau) <= TORQUE_STEP + ROUNDING).all():
-                return TORQUE_JUMP
+                return "controller_torque_discontinuity"
             self.tau = command.tau.copy()
         if self.generator == Generator.NONE:
             self.finished = command.torque_finished

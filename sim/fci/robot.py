@@ -29,13 +29,6 @@ from sim.truth import Array
 RECOVERY_TICKS = 100  # chosen: long enough to be seen in states, short for tests
 STANDING = 0.02  # rad/s, slower counts as standing
 
-POSITION_LIMITS, TOO_FAST = "joint_position_limits_violation", "joint_velocity_violation"
-TORQUE_RANGE, COLLISION, CARTESIAN_COLLISION = (
-    "tau_J_range_violation",
-    "joint_reflex",
-    "cartesian_reflex",
-)
-
 
 class Robot:
     """One arm and its controller.
@@ -214,21 +207,21 @@ class Robot:
         arm, settings = self.arm, self.settings
         found = []
         if arm.outside:
-            found.append(POSITION_LIMITS)
+            found.append("joint_position_limits_violation")
         slowest, fastest = arm.truth.limits.speeds(arm.q)
         near_end = (arm.dq < slowest - STANDING) | (arm.dq > fastest + STANDING)
         if (near_end | (np.abs(arm.dq) > arm.truth.limits.velocity)).any():
-            found.append(TOO_FAST)
+            found.append("joint_velocity_violation")
         if arm.saturated:
-            found.append(TORQUE_RANGE)
+            found.append("tau_J_range_violation")
         hit = np.abs(arm.tau_external) > settings.upper_torque
         if hit.any():
             self.joint_collision[hit] = 1.0
-            found.append(COLLISION)
+            found.append("joint_reflex")
         hit = np.abs(arm.wrench) > settings.upper_force
         if hit.any():
             self.cartesian_collision[hit] = 1.0
-            found.append(CARTESIAN_COLLISION)
+            found.append("cartesian_reflex")
         if found:
             self.trip(*found)
 

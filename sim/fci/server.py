@@ -6,6 +6,7 @@ import argparse
 import select
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -50,17 +51,18 @@ class ClientSession:
     Attributes:
         open: the connection stands.
         connected: the Connect request has succeeded; states are sent.
-        foreign: datagrams that were no command of this version.
-        stale: commands for a state other than the last one.
     """
 
-    def __init__(self, tcp: socket.socket, version: int) -> None:
+    def __init__(self, tcp: socket.socket, version: int, unused: Counter[str]) -> None:
+        """Args: unused: counts datagrams that are `foreign` (no command of this version) or `stale`
+        (for a state other than the last one).
+        """
         tcp.setblocking(False)
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._tcp, self._version = tcp, version
+        self._tcp, self._version, self._unused = tcp, version, unused
         self._udp: socket.socket | None = None
         self._reader, self._out = RequestReader(version), bytearray()
-        self.open, self.foreign, self.stale = True, 0, 0
+        self.open = True
 
     @property
     def connected(self) -> bool:
@@ -139,11 +141,11 @@ class ClientSession:
                 continue
             command = read_command(data, self._version)
             if command is None:
-                self.foreign += 1
+                self._unused["foreign"] += 1
             elif command.message_id == message_id:
                 found = command
             else:
-                self.stale += 1
+                self._unused["stale"] += 1
         return found
 
     def close(self) -> None:
@@ -230,7 +232,7 @@ class FciServer:
         self._tick = self._id = self._silent_until = 0
         self._owed = self._answering = False  # a command for the last state; any in this motion
         self._sent = self._clients = self._refused = 0
-        self._foreign = self._stale = 0
+        self._unused: Counter[str] = Counter()
 
     def serve(self, stop: Callable[[], bool]) -> None:
         """Run the robot until `stop()` is true."""
@@ -257,7 +259,7 @@ class FciServer:
 
     def summary(self) -> dict[str, Any]:
         """What happened so far."""
-        robot, session = self.robot, self._session
+        robot = self.robot
         return {
             "protocol": self._version,
             "ticks": self._tick,
@@ -267,8 +269,8 @@ class FciServer:
             "refused_clients": self._refused,
             "commands_received": robot.received,
             "commands_missed": robot.missed,
-            "commands_stale": self._stale + (session.stale if session else 0),
-            "foreign_datagrams": self._foreign + (session.foreign if session else 0),
+            "commands_stale": self._unused["stale"],
+            "foreign_datagrams": self._unused["foreign"],
             "violations": list(robot.violations),
             "faults": dict(self._spoiler.counts),
         }
@@ -297,11 +299,11 @@ class FciServer:
         self._strike()
         session, robot, command = self._session, self.robot, None
         if session is not None:
-            before = session.stale
+            before = self._unused["stale"]
             command = self._answer_to_state(session)
             # It may be late from its very first command on, which then answers no tick.
             self._answering = robot.motion is not None and (
-                self._answering or robot.motion.begun or session.stale > before
+                self._answering or robot.motion.begun or self._unused["stale"] > before
             )
             if command is not None and self._spoiler.loses_command(self._tick):
                 command = None
@@ -347,15 +349,13 @@ class FciServer:
             tcp.close()
             return
         self._clients += 1
-        self._session = ClientSession(tcp, self._version)
+        self._session = ClientSession(tcp, self._version, self._unused)
 
     def _drop(self) -> None:
         session, self._session, self._owed = self._session, None, False
         if session is None:
             return
         session.close()
-        self._foreign += session.foreign
-        self._stale += session.stale
         self.robot.drop_client()
         self._spoiler.forget()
 

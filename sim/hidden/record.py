@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from drivers.files.mcap import Commands, Log, write_log
 from drivers.interface import JointSample
-from sim.dynamics import torques
 from sim.hidden.trial import Trial, nominal_urdf, seal
 from sim.noise import SensorNoise, levels_of
 from sim.plant import PERIOD_NS, Plant
@@ -25,27 +24,6 @@ INTEGRAL_S = 8.0  # 1/s, pole of the slow part that carries friction and payload
 PERIOD_S = 1e-3
 
 
-class Follower:
-    """Torque that makes a nominal arm follow a motion: M (ddq + feedback) + bias.
-
-    It knows the motors' inertias, as drives do: where links weigh little it would shake without.
-    """
-
-    def __init__(self, trial: Trial) -> None:
-        self._arm = trial.nominal
-        self._sum = np.zeros(trial.nominal.n)
-        self._effort, self._motors = trial.nominal.limits.effort, trial.motor_inertia
-
-    def torque(self, q: Array, dq: Array, wanted: tuple[Array, Array, Array]) -> Array:
-        """Torque (n,) N m at q, dq (n,) for the wanted q, dq, ddq of the next instant."""
-        behind = wanted[0] - q
-        self._sum += PERIOD_S * behind
-        push = RATE_S**2 * (behind + INTEGRAL_S * self._sum) + 2 * RATE_S * (wanted[1] - dq)
-        arm, ddq = self._arm, wanted[2] + push
-        tau = torques(arm.frames, arm.theta, arm.base, q, dq, ddq) + self._motors * ddq
-        return np.clip(tau, -self._effort, self._effort)
-
-
 def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
     """Noise-free readings q, dq, tau and the commands (m, n) of a trial.
 
@@ -54,8 +32,9 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
     """
     disturbance, m = trial.disturbance(), len(trial.times)
     wanted = trial.motion.at(PERIOD_S * np.arange(m + 1, dtype=float))
-    truth = trial.arm.with_changes(effects=trial.effects)
-    plant, follower = Plant(truth, noise=levels_of("none")), Follower(trial)
+    truth, arm = trial.arm.with_changes(effects=trial.effects), trial.nominal
+    plant, motors = Plant(truth, noise=levels_of("none")), truth.motor_inertia
+    total = np.zeros(arm.n)
     out, rubs = np.empty((4, m, truth.n)), np.zeros((m + 1, truth.n))
     bent = None if trial.friction is None else trial.friction.start * trial.friction.coulomb
     for k in range(m):
@@ -63,8 +42,15 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
         if plant.fault is not None:
             raise RuntimeError(f"trial {trial.seed}: {plant.fault}")
         q, dq, _ = plant.link_state()
-        goal = wanted[0][k + 1], wanted[1][k + 1], wanted[2][k + 1]
-        tau = follower.torque(q, dq, goal)
+        goal, speed, acceleration = (x[k + 1] for x in wanted)
+        # The torque that makes the nominal arm follow: M (ddq + feedback) + bias. It knows the
+        # motors' inertias, as drives do: where links weigh little it would shake without.
+        behind = goal - q
+        total += PERIOD_S * behind
+        push = RATE_S**2 * (behind + INTEGRAL_S * total) + 2 * RATE_S * (speed - dq)
+        ddq = acceleration + push
+        tau = arm.torques(q, dq, ddq) + motors * ddq
+        tau = np.clip(tau, -arm.limits.effort, arm.limits.effort)
         out[0, k], out[1, k], out[2, k] = sample.q, sample.dq, sample.tau
         out[3, k] = tau
         if trial.friction is not None and bent is not None:
@@ -108,10 +94,7 @@ def log_of(
 
 
 def write(
-    trial: Trial,
-    folder: Path | str,
-    recording: Log | None = None,
-    simulator: str = "pybullet",
+    trial: Trial, folder: Path | str, recording: Log | None = None, simulator: str = "pybullet"
 ) -> tuple[Path, Path, Path]:
     """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.effects import PAIRS, Effect
-from sim.truth import Array, Truth, direction
+from sim.truth import FLANGE_M, Array, Truth, direction
 
 SECONDS = 20.0
 WIDER = np.sqrt(3.0)  # either end of a range of sizes is further out by this
@@ -41,7 +41,6 @@ DELAY = (1e-3, 5e-3)  # s
 BRISTLE = (5e-4, 1e-2)  # rad over which friction winds up
 LOW_PASS, LOW_PASS_POLES = (0.015, 0.03), (0.75, 1.0)  # d, s; c / d^2: two equal poles to one
 MASS = (0.3, 3.0)  # kg
-FLANGE_M = 0.107  # m, from the frame of link 7 along z (franka_ros)
 BODY_M = (0.02, 0.06)  # half side of the box that a payload is
 BEYOND_M, ASIDE_M = (0.02, 0.1), 0.05  # its centre from the flange, along and across
 TILT = (np.radians(0.5), np.radians(3.0))
@@ -78,6 +77,11 @@ def _sign(rng: np.random.Generator) -> float:
 def torque_size(rng: np.random.Generator, joint: int, span: tuple[float, float]) -> float:
     """A size of a torque on `joint` (from 1), four tenths on joints 5 to 7; see `wide`."""
     return wide(rng, span) * (WRIST_SHARE if joint >= WRIST else 1.0)
+
+
+def wrist_shares(n: int) -> Array:
+    """(n,) of a torque on each joint: one, WRIST_SHARE from joint WRIST (from 1) on."""
+    return np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
 
 
 def _of(**draws: Draw) -> Maker:
@@ -203,10 +207,7 @@ OUTSIDE: dict[str, tuple[tuple[int, ...], Maker]] = {
     "x_quadratic_drag": (ALL, _of(c=_torque(DRAG))),
     "x_cubic_spring": (ALL, _of(q0=_rest(0.3), c=_torque(CUBIC))),
     "x_position_friction": (ALL, _of(A=_torque(COULOMB), phase=_phase)),
-    "x_sine_disturbance": (
-        ALL,
-        _of(phase=_phase, a=_torque(RIPPLE), f=_exact(SINE_HZ)),
-    ),
+    "x_sine_disturbance": (ALL, _of(phase=_phase, a=_torque(RIPPLE), f=_exact(SINE_HZ))),
     "x_velocity_ripple": (ALL, _of(phase=_phase, n=_order, a=_torque(VISCOUS))),
     "x_cross_viscous": (ALL, _of(c=_torque(VISCOUS))),
     "x_torque_crosstalk": (ALL, _of(share=_plain(CROSSTALK, signed=True))),
@@ -278,8 +279,8 @@ class Bristles:
 
 
 def draw_bristles(rng: np.random.Generator, n: int) -> Bristles:
-    """Of n joints; WRIST_SHARE of the torques from joint WRIST (from 1) on."""
-    share = np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
+    """Of n joints, their torques by `wrist_shares`."""
+    share = wrist_shares(n)
     coulomb = share * sizes(rng, RUB_COULOMB, n)
     return Bristles(
         coulomb,

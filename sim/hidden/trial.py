@@ -24,18 +24,17 @@ from sim.hidden.sizes import (
     COULOMB,
     OUTSIDE,
     SECONDS,
-    WRIST,
-    WRIST_SHARE,
     Bristles,
     draw_bristles,
     draw_effect,
     log_uniform,
     torque_size,
+    wrist_shares,
 )
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
 from sim.truth import Array, Truth, body_of, panda
-from sim.urdf_writer import limit_text, urdf
+from sim.urdf_writer import urdf
 
 FORMAT, VERSION = "panda-adapter/hidden-truth", 1
 KINDS = ("null", "single", "pair", "outside")
@@ -43,7 +42,7 @@ SHARES = (0.25, 0.40, 0.25, 0.10)
 COMMANDS_SHARE = 0.5  # of the recordings have /joint_commands
 MODEL_ERROR = (0.005, 0.05)  # rms error of the nominal model's inertial numbers, of their sizes
 FRICTION_SHARE = 0.4  # of the trials have friction in every joint beside what is hidden
-DISTURBANCE_NM = (0.02, 0.08)  # rms; WRIST_SHARE of it on joints 5 to 7
+DISTURBANCE_NM = (0.02, 0.08)  # rms; less on joints 5 to 7
 DISTURBANCE_HZ = (0.3, 3.0)  # corner of the low-pass that colours it
 TRIAL_STREAM, DISTURBANCE_STREAM = 34, 35  # apart from the streams of the noise
 ATTEMPTS = 1000
@@ -108,10 +107,7 @@ class Trial:
     @property
     def motor_inertia(self) -> Array:
         """(n,) kg m2 that the effects add to the joints."""
-        out = np.zeros(self.arm.n)
-        for effect in (e for e in self.effects if e.name == "motor_inertia"):
-            out[effect.columns(self.arm.n)] += effect.number("B")
-        return out
+        return self.arm.with_changes(effects=self.effects).motor_inertia
 
     def disturbance(self) -> Array:
         """(m, n) N m: first-order low-passed noise, the same at every call."""
@@ -185,11 +181,10 @@ def draw(
     arm = nominal.with_changes(theta=wrong_bodies(nominal.theta, model_error, rng))
     path = draw_motion(rng, arm.limits, arm.ready, motion)
     arm = arm.with_changes(ready=path.middle)
-    share = np.where(np.arange(1, arm.n + 1) >= WRIST, WRIST_SHARE, 1.0)
     return Trial(
         seed=seed,
         kind=kind,
-        disturbance_nm=share * rng.uniform(*DISTURBANCE_NM, arm.n),
+        disturbance_nm=wrist_shares(arm.n) * rng.uniform(*DISTURBANCE_NM, arm.n),
         disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
         commands=bool(rng.random() < COMMANDS_SHARE),
         effects=_effects(rng, kind, arm, effect, RUBS if rubs or sticks else ())
@@ -268,12 +263,7 @@ def first_order(white: Array, keep: float) -> Array:
 
 def nominal_urdf(nominal: Truth) -> str:
     """The nominal model as URDF text with the joints' limits."""
-    text = urdf(nominal)
-    for j, name in enumerate(nominal.joint_names):
-        old = f'<joint name="{name}" type="continuous">'
-        bound = limit_text(nominal.limits, j)
-        text = text.replace(old, f'<joint name="{name}" type="revolute">{bound}')
-    return text
+    return urdf(nominal, limited=True)
 
 
 def seal(contents: dict[str, Any]) -> str:

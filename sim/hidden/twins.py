@@ -18,19 +18,10 @@ from scipy.signal import lfilter
 from drivers.files.mcap import Log
 from sim.hidden.motion import MARGIN_RAD, hand, points
 from sim.hidden.record import log_of
-from sim.hidden.sizes import (
-    FLANGE_M,
-    WRIST,
-    WRIST_SHARE,
-    Bristles,
-    box_moments,
-    draw_bristles,
-    log_uniform,
-    sizes,
-)
+from sim.hidden.sizes import Bristles, box_moments, draw_bristles, log_uniform, sizes, wrist_shares
 from sim.hidden.trial import first_order, wrong_body
 from sim.noise import levels_of
-from sim.truth import Array, Truth, panda, theta_of
+from sim.truth import FLANGE_M, Array, Truth, panda, theta_of
 
 STREAM, NOISE_STREAM = 36, 37  # apart from those of the other trials
 STEP_S = 1e-3  # of the motion that is recorded
@@ -114,7 +105,6 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
     if motion:
         q, kind = _motion(np.random.default_rng([seed, STREAM, motion]), nominal)
     theta[-1] += body
-    share = np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
     return Twin(
         seed=seed,
         arm=nominal.with_changes(theta=theta, ready=q[0]),
@@ -124,7 +114,7 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
         q=q,
         kind=kind,
         friction=draw_bristles(rng, n),
-        offset=share * OFFSET_NM * rng.standard_normal(n),
+        offset=wrist_shares(n) * OFFSET_NM * rng.standard_normal(n),
         sensor_hz=sizes(rng, SENSOR_HZ, n),
         dq_late_s=float(rng.uniform(*DQ_LATE_S)),
         motion_number=motion,
@@ -167,9 +157,10 @@ def recorded(twin: Twin, q: Array, dq: Array, tau: Array) -> Log:
     keep = np.exp(-2 * np.pi * twin.sensor_hz * STEP_S)
     low = [lfilter([1 - k], [1, -k], x, zi=[k * x[0]])[0] for k, x in zip(keep, tau.T, strict=True)]
     pace = float(np.exp(-2 * np.pi * log_uniform(rng, DISTURBANCE_HZ) * STEP_S))
-    share = np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
     coloured = first_order(rng.standard_normal((m, n)), pace)
-    tau = np.array(low).T + twin.offset + share * rng.uniform(*DISTURBANCE_NM, n) * coloured
+    tau = (
+        np.array(low).T + twin.offset + wrist_shares(n) * rng.uniform(*DISTURBANCE_NM, n) * coloured
+    )
     t, stamps, rows = STEP_S * np.arange(m), *_stamps(rng, STEP_S * (m - 1))
     late = {0: 0.0, 1: twin.dq_late_s, 2: 0.0}
     signals = [

@@ -32,7 +32,7 @@ from sim.ending import Ending, sum_up
 from sim.faults import Fault, read_fault
 from sim.fci.clock import PRIORITY, Ticks, undisturbed
 from sim.options import options_of
-from sim.ros2.options import KINDS, check
+from sim.ros2.options import KINDS
 from sim.scenarios import Scenario, build
 from sim.truth import Truth
 from sim.urdf_writer import joint_text, limit_text
@@ -47,40 +47,32 @@ SUBSTEPS = 2
 OFF_RAD = 0.5  # by which a joint is wrong where faults say so
 SECOND_NS = 1_000_000_000
 
+
+def _message(package: str, kind: str, /, **fields: Any) -> Any:
+    return make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields)
+
+
 # The four messages that the arm speaks; names and layout are ROS 2's.
-Time = make_idl_struct(
-    "Time_",
-    "builtin_interfaces.msg.dds_.Time_",
-    {"sec": types.int32, "nanosec": types.uint32},
+Doubles = types.sequence[types.float64]
+Time = _message("builtin_interfaces", "Time", sec=types.int32, nanosec=types.uint32)
+Header = _message("std_msgs", "Header", stamp=Time, frame_id=str)
+JointState = _message(
+    "sensor_msgs",
+    "JointState",
+    header=Header,
+    name=types.sequence[str],
+    position=Doubles,
+    velocity=Doubles,
+    effort=Doubles,
 )
-Header = make_idl_struct("Header_", "std_msgs.msg.dds_.Header_", {"stamp": Time, "frame_id": str})
-JointState = make_idl_struct(
-    "JointState_",
-    "sensor_msgs.msg.dds_.JointState_",
-    {
-        "header": Header,
-        "name": types.sequence[str],
-        "position": types.sequence[types.float64],
-        "velocity": types.sequence[types.float64],
-        "effort": types.sequence[types.float64],
-    },
+Dimension = _message(
+    "std_msgs", "MultiArrayDimension", label=str, size=types.uint32, stride=types.uint32
 )
-Dimension = make_idl_struct(
-    "MultiArrayDimension_",
-    "std_msgs.msg.dds_.MultiArrayDimension_",
-    {"label": str, "size": types.uint32, "stride": types.uint32},
+Layout = _message(
+    "std_msgs", "MultiArrayLayout", dim=types.sequence[Dimension], data_offset=types.uint32
 )
-Layout = make_idl_struct(
-    "MultiArrayLayout_",
-    "std_msgs.msg.dds_.MultiArrayLayout_",
-    {"dim": types.sequence[Dimension], "data_offset": types.uint32},
-)
-Float64MultiArray = make_idl_struct(
-    "Float64MultiArray_",
-    "std_msgs.msg.dds_.Float64MultiArray_",
-    {"layout": Layout, "data": types.sequence[types.float64]},
-)
-String = make_idl_struct("String_", "std_msgs.msg.dds_.String_", {"data": str})
+Float64MultiArray = _message("std_msgs", "Float64MultiArray", layout=Layout, data=Doubles)
+String = _message("std_msgs", "String", data=str)
 
 
 @dataclass(frozen=True)
@@ -242,7 +234,6 @@ def description(truth: Truth) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """`adapter sim ros2`: serve until a signal comes or the time is over. Raises ValueError."""
-    check(args)
     scenario = build(args.scenario, args.seed, **options_of(args.set))
     place = Place(
         args.domain, args.states, args.commands, args.every, args.watch, not args.no_description

@@ -14,7 +14,8 @@ from adapter.control.settings import ExcitationSettings
 from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
 from adapter.signals.front_end import FrontEnd
-from sim.scenarios import FLANGE_M, SIDE_STEP_M, STAND_OFF_M, build
+from sim.scenarios import SIDE_STEP_M, STAND_OFF_M, build
+from sim.truth import FLANGE_M
 from tests.helpers.lockstep_drivers import opened
 
 PANDA = documented("panda")

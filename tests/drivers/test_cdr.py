@@ -63,12 +63,7 @@ def test_joint_state_means_the_same_to_both(stamp_ns, frame_id, names, numbers, 
         assert list(getattr(ours, field)) == expected
 
 
-@given(
-    stamps,
-    texts,
-    st.lists(texts, max_size=4),
-    *[st.lists(doubles, max_size=4) for _ in FIELDS],
-)
+@given(stamps, texts, st.lists(texts, max_size=4), *[st.lists(doubles, max_size=4) for _ in FIELDS])
 def test_what_the_other_encodes_is_read(stamp_ns, frame_id, names, position, velocity, effort):
     message = SimpleNamespace(
         header=header(stamp_ns, frame_id),

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.faults import KINDS, Fault, Faults
 from drivers.faults.alter import corrupt, corrupt_stamp
 from drivers.faults.driver import FaultyDriver, with_faults
+from drivers.faults.spec import KINDS, Fault, Faults
 from drivers.files.log import LogArm
 from drivers.interface import DriverError, EndOfStream, JointSample
 from tests.helpers.live_tools import simulated_arm

@@ -213,9 +213,7 @@ def test_no_joint_states_names_what_was_found(tmp_path):
         read_log(path, topic="/arm/states")
     assert len(read_log(path, topic="/arm/joint_states")) == 3
     other = foreign(
-        tmp_path / "b.mcap",
-        [(1, MotionEncoder("a").encode(1, np.zeros(6)))],
-        schema=TWIST_STAMPED,
+        tmp_path / "b.mcap", [(1, MotionEncoder("a").encode(1, np.zeros(6)))], schema=TWIST_STAMPED
     )
     with pytest.raises(DriverError, match="holds geometry_msgs/msg/TwistStamped encoded as cdr"):
         read_log(other)

@@ -24,7 +24,7 @@ from sim.damiao import codec as wire
 from sim.damiao.bus import open_bus
 from sim.damiao.host import ServedBus
 from sim.damiao.motor import SETS
-from sim.damiao.options import add_arguments
+from sim.damiao.options import add_arguments, check
 from sim.damiao.server import BoardOptions, Boards, run
 from sim.effects import Effect
 from sim.noise import levels_of
@@ -457,7 +457,9 @@ def command(*options: str) -> int:
     """The command in this process."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    return run(parser.parse_args(options))
+    args = parser.parse_args(options)
+    check(args)
+    return run(args)
 
 
 def test_across_processes_until_sigterm(tmp_path) -> None:

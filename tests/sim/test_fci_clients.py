@@ -7,8 +7,7 @@ import pinocchio as pin
 import pytest
 
 from sim.effects import payload
-from sim.scenarios import FLANGE_M
-from sim.truth import documented, panda
+from sim.truth import FLANGE_M, documented, panda
 from tests.helpers import fci_clients
 from tests.helpers.arm_data import pin_model
 from tests.helpers.fci_clients import TOLD

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from sim.dynamics import end_effector
-from sim.obstacles import HAND, Obstacles
+from sim.obstacles import Obstacles
 from sim.options import check
 from sim.scenarios import build
+from sim.truth import FLANGE
 
 
 def driven(trouble: dict, push: float, ticks: int = 400):
@@ -33,7 +34,7 @@ def test_a_wall_stands_across_the_hand_s_way_and_only_pushes_back() -> None:
     arm = build("nominal", trouble={"wall": 0.02}).truth
     wall = Obstacles(arm.effects, arm.n)
     q, dq = arm.ready, np.array([0.5, 0.2, 0.0, 0.1, 0.0, 0.0, 0.0])
-    _, J = end_effector(arm.frames, q, HAND)
+    _, J = end_effector(arm.frames, q, FLANGE)
     speed = np.linalg.norm(J[:3] @ dq)
     for ahead, depth in ((0.0, 0.0), (0.019, 0.0), (0.021, 0.001), (0.025, 0.005)):
         wall.act(0.0, q + dq * ahead / speed, dq, arm.frames)
@@ -60,7 +61,7 @@ def test_trouble_that_cannot_be_is_refused(trouble, said: str) -> None:
 
 def test_a_floor_carries_the_hand_and_lets_it_slide_only_when_pushed_hard() -> None:
     arm = build("nominal").truth
-    pose, J = end_effector(arm.frames, arm.ready, HAND)
+    pose, J = end_effector(arm.frames, arm.ready, FLANGE)
     floor = Obstacles(build("nominal", trouble={"floor": pose[2, 3] + 1e-3}).truth.effects, arm.n)
     way = np.linalg.pinv(J)  # of joint motions that move the hand
 
@@ -68,7 +69,7 @@ def test_a_floor_carries_the_hand_and_lets_it_slide_only_when_pushed_hard() -> N
         """Force on the hand when it stands so far off the start."""
         q = arm.ready + way @ [x, 0.0, z, 0.0, 0.0, 0.0]
         floor.act(0.0, q, np.zeros(7), arm.frames)
-        return np.linalg.pinv(end_effector(arm.frames, q, HAND)[1].T) @ floor.torque
+        return np.linalg.pinv(end_effector(arm.frames, q, FLANGE)[1].T) @ floor.torque
 
     assert pushed(0.0, 0.0)[:3] == pytest.approx([0.0, 0.0, 20.0], abs=0.1)
     assert pushed(2e-4, 0.0)[:3] == pytest.approx([-4.0, 0.0, 20.0], abs=0.1)

@@ -426,6 +426,6 @@ def test_every_effect_of_the_catalogue_is_tested_here():
 @pytest.mark.parametrize(("start_s", "level"), [(2.0, 2.4), (-np.inf, 4.0)])
 def test_a_drift_grows_from_its_own_start(start_s, level):
     rows, nought = np.zeros((1, 8)), np.zeros(1)
-    rows[0, [0, 3, 6, 7]] = Row.DRIFT, 0.8, start_s, np.inf
+    rows[0, [0, 3, 6, 7]] = Row.FRICTION_DRIFT, 0.8, start_s, np.inf
     parts = joint_effects.add_up(rows, 5.0, nought, nought, nought, nought)
     assert parts[2:4, 0] == pytest.approx([level, level])

@@ -80,9 +80,13 @@ def open_scan(path: Path) -> Scan:
         return BagScan(path, ".db3")
     if head.startswith(_ROS1):
         return BagScan(path, ".bag")
-    if any(head.startswith(magic) for magic in _PACKED):
-        return _unpacked(path, head)
-    return McapOfAnyRos(path)
+    unpack = _unpacker(head)
+    return McapOfAnyRos(path) if unpack is None else _unpacked(path, unpack)
+
+
+def _unpacker(head: bytes) -> Callable[[Any], Any] | None:
+    """What unpacks a file that begins so; None where it is not packed."""
+    return next((unpack for magic, unpack in _PACKED.items() if head.startswith(magic)), None)
 
 
 def is_recording(path: Path) -> bool:
@@ -95,7 +99,7 @@ def is_recording(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             head = file.read(len(_SQLITE))
-            unpack = next((f for magic, f in _PACKED.items() if head.startswith(magic)), None)
+            unpack = _unpacker(head)
             if unpack is not None:
                 file.seek(0)
                 head = unpack(file).read(len(_SQLITE))
@@ -129,51 +133,52 @@ def _files_of(folder: Path) -> list[Path]:
     return files
 
 
-class _TooLarge(ValueError):
-    """A bag makes more of its bytes than any recording does."""
-
-
 class _Growth:
-    """What a file may still make of its bytes."""
+    """What a file may still make of its bytes, by one pass over it.
 
-    def __init__(self, stored: int) -> None:
-        """Args: stored: its bytes, as they came."""
-        self._left = GROWTH_LIMIT * stored + CHUNK_LIMIT
+    Args:
+        path: of the file, for sentences; stored: its bytes, as they came.
+    """
+
+    def __init__(self, path: Path, stored: int) -> None:
+        self._path, self._left = path, GROWTH_LIMIT * stored + CHUNK_LIMIT
+
+    def refuse(self, why: str) -> None:
+        """Raises DriverError: no recorder makes such a file."""
+        raise DriverError(f"{self._path}: {why}; not read")
 
     def spend(self, size: int) -> None:
-        """Count bytes that were made. Raises _TooLarge."""
+        """Count bytes that were made. Raises DriverError."""
         self._left -= size
         if self._left < 0:
-            raise _TooLarge(f"would grow more than {GROWTH_LIMIT} times; not read")
+            self.refuse(f"would grow more than {GROWTH_LIMIT} times")
 
     def message(self, raw: object) -> bytes:
-        """A message, unpacked where it is packed: CDR never begins like zstd. Raises _TooLarge."""
+        """A message, unpacked where packed: CDR never begins like zstd. Raises DriverError."""
         if not isinstance(raw, bytes):  # a database holds anything anywhere
             raw = b""  # counted as unreadable
         if raw[: len(_ZSTD)] == _ZSTD:
             try:
-                raw = _bounded(zstandard.ZstdDecompressor().stream_reader(raw))
+                raw = self.all_of(zstandard.ZstdDecompressor().stream_reader(raw))
             except zstandard.ZstdError:
                 raw = b""
         self.spend(len(raw))
         return raw
 
+    def all_of(self, stream: Any) -> bytes:
+        """All that a chunk or message makes. Raises DriverError."""
+        parts, size = [], 0
+        while part := stream.read(_STEP):
+            parts.append(part)
+            size += len(part)
+            if size > CHUNK_LIMIT:
+                self.refuse(f"a chunk or message makes more than {CHUNK_LIMIT} bytes")
+        return b"".join(parts)
 
-def _bounded(stream: Any) -> bytes:
-    """All that a chunk or message makes. Raises _TooLarge."""
-    parts, size = [], 0
-    while part := stream.read(_STEP):
-        parts.append(part)
-        size += len(part)
-        if size > CHUNK_LIMIT:
-            raise _TooLarge(f"a chunk or message makes more than {CHUNK_LIMIT} bytes; not read")
-    return b"".join(parts)
 
-
-def _unpacked(path: Path, head: bytes) -> Scan:
+def _unpacked(path: Path, unpack: Callable[[Any], Any]) -> Scan:
     """What lies in a compressed file; errors and warnings name the file itself."""
-    unpack = next(unpack for magic, unpack in _PACKED.items() if head.startswith(magic))
-    growth = _Growth(path.stat().st_size)
+    growth = _Growth(path, path.stat().st_size)
     with ExitStack() as until:
         whole = Path(until.enter_context(tempfile.TemporaryDirectory())) / "unpacked"
         try:
@@ -181,12 +186,10 @@ def _unpacked(path: Path, head: bytes) -> Scan:
                 while part := stream.read(_STEP):
                     growth.spend(len(part))
                     out.write(part)
-        except _TooLarge as error:
-            raise DriverError(f"{path}: {error}") from error
         except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError) as error:
             raise DriverError(f"{path}: cannot be unpacked: {error}") from error
         with whole.open("rb") as file:
-            if file.read(len(_ZSTD)).startswith(tuple(_PACKED)):
+            if _unpacker(file.read(len(_ZSTD))):
                 raise DriverError(f"{path}: is packed twice; unpack it once")
         try:
             scan = open_scan(whole)
@@ -214,14 +217,11 @@ class FolderScan(Scan):
     def regions(self) -> Iterator[Region]:
         """The messages of its files. Raises DriverError where one of them cannot be read."""
         channels: dict[tuple[str, str, str], None] = {}
-        growth = _Growth(sum(file.stat().st_size for file in self._files))
+        growth = _Growth(self.path, sum(file.stat().st_size for file in self._files))
         for file in self._files:
             part = open_scan(file)
             for region in part.regions():
-                try:
-                    growth.spend(int((region.stop - region.start).sum()))
-                except _TooLarge as error:
-                    raise DriverError(f"{self.path}: {error}") from error
+                growth.spend(int((region.stop - region.start).sum()))
                 # Each file numbers its channels in its own way.
                 self.channels, self.schemas = part.channels, part.schemas
                 yield region
@@ -256,15 +256,15 @@ class BagScan(Scan):
 
     def regions(self) -> Iterator[Region]:
         """The messages of known types; others are counted in `passed`. Raises DriverError."""
-        self._growth = _Growth(self.stored)
+        self._growth = _Growth(self.path, self.stored)
         with tempfile.TemporaryDirectory() as folder:
             # Under a plain name: in the user's `?` and `#` would be read as parts of an address.
             link = Path(folder) / f"bag{self._kind}"
             link.symlink_to(self._whole)
             try:
                 yield from self._messages(link)
-            except _TooLarge as error:
-                raise DriverError(f"{self.path}: {error}") from error
+            except DriverError:
+                raise
             except Exception as error:  # rosbags' own, SQLite's, and those of damaged bytes
                 said = " ".join(str(error).replace(str(link), "it").split())[:200]
                 raise DriverError(
@@ -273,8 +273,8 @@ class BagScan(Scan):
                 ) from error
 
     def _messages(self, link: Path) -> Iterator[Region]:
-        chunks = _Growth(self.stored)
-        with _open_ros1(link, chunks) if self._one else _open_sqlite(link) as bag:
+        growth = _Growth(self.path, self.stored)
+        with (_open_ros1 if self._one else _open_sqlite)(link, growth) as bag:
             for c in bag.connections:
                 if not (isinstance(c.topic, str) and isinstance(c.msgtype, str)):
                     raise ValueError("the name or type of a topic is no text")
@@ -302,25 +302,25 @@ class BagScan(Scan):
             yield _HEAD.pack(connection.id, number % 2**32, time_ns, time_ns), raw
 
 
-def _open_sqlite(path: Path) -> Any:
+def _open_sqlite(path: Path, growth: _Growth) -> Any:
     """A reader of an SQLite file, whose messages are what it stores and nothing more.
 
     A database may compute what a table holds, and point to the same bytes again and again, so
-    that a few bytes fill the memory while they are sorted. Raises _TooLarge.
+    that a few bytes fill the memory while they are sorted. Raises DriverError.
     """
     with closing(sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)) as base:
         made = base.execute(_COMPUTED).fetchone()
         if made is not None:
-            raise _TooLarge(f"computes '{made[0]}' instead of storing it; not read")
+            growth.refuse(f"computes '{made[0]}' instead of storing it")
         topics = base.execute("SELECT * FROM topics")
         columns = [column[0] for column in topics.description]
         told = [dict(zip(columns, row, strict=True)).get(_QOS) or "" for row in topics]
         # rosbags reads these as YAML, in which anchors are what grows.
         if sum(len(str(x)) for x in told) > _METADATA_LIMIT or any("&" in str(x) for x in told):
-            raise _TooLarge(f"has {_QOS} that no recorder writes; not read")
+            growth.refuse(f"has {_QOS} that no recorder writes")
         (size,) = base.execute("SELECT total(length(data)) FROM messages").fetchone()
     if size > path.stat().st_size:
-        raise _TooLarge(f"would tell {size:.0f} bytes of messages, more than it has; not read")
+        growth.refuse(f"would tell {size:.0f} bytes of messages, more than it has")
     return importlib.import_module("rosbags.rosbag2").Reader(path)
 
 
@@ -337,10 +337,10 @@ def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
     def read_bounded() -> Any:
         def unpack(data: bytes) -> bytes:  # records never begin like what packs them
             if data.startswith(b"BZh"):
-                content = _bounded(bz2.BZ2File(BytesIO(data)))
+                content = growth.all_of(bz2.BZ2File(BytesIO(data)))
             elif data.startswith(_LZ4):
                 frame = importlib.import_module("lz4.frame")
-                content = _bounded(frame.LZ4FrameFile(BytesIO(data)))
+                content = growth.all_of(frame.LZ4FrameFile(BytesIO(data)))
             else:
                 return data
             growth.spend(len(content))
@@ -354,7 +354,7 @@ def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
         read_index(place, indexes)
         left -= reader.bio.tell() - begin
         if left < 0:
-            raise _TooLarge("has chunks that share their index; not read")
+            growth.refuse("has chunks that share their index")
 
     reader.read_chunk, reader.read_index_data = read_bounded, read_index_once
     with reader:
@@ -371,7 +371,7 @@ class McapOfAnyRos(McapScan):
 
     def regions(self) -> Iterator[Region]:
         """All complete messages, in the order of the file; damaged chunks are passed over."""
-        self._growth = _Growth(self.stored)
+        self._growth = _Growth(self.path, self.stored)
         for region in super().regions():
             numbers = np.unique(region.channel).tolist()
             # A file repeats its channels in each chunk, so their telling is put right each time.
@@ -379,10 +379,7 @@ class McapOfAnyRos(McapScan):
                 self._tell_as_cdr(number)
             packed = self._packed(region)
             if packed.any() or any(number in self._from_ros1 for number in numbers):
-                try:
-                    yield from _regions(self._told(region, packed))
-                except _TooLarge as error:
-                    raise DriverError(f"{self.path}: {error}") from error
+                yield from _regions(self._told(region, packed))
             else:
                 yield region
 

@@ -218,13 +218,13 @@ def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
     return _topics_told(collect(scan, lambda series: False)), scan.warnings, scan.truncated
 
 
-def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[str, Any]]:
+def read_estimates(path: str | Path) -> Iterator[dict[str, Any]]:
     """The estimates in a recording, in the order of the file, as `estimate_values` tells them.
 
     Those of recordings before version 0.2 are JSON and tell less: no names, no standard
     deviations. Raises DriverError.
     """
-    for message in read_messages(path, topic):
+    for message in read_messages(path, ESTIMATES):
         if message.schema == ESTIMATE:
             yield estimate_values(message.fields)
         else:

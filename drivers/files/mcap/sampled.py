@@ -19,10 +19,7 @@ from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
 
 SAMPLED_FROM = 2**26  # bytes; a smaller file is read whole
-_INDEXED = {
-    Opcode.METADATA_INDEX: Opcode.METADATA,
-    Opcode.ATTACHMENT_INDEX: Opcode.ATTACHMENT,
-}
+_INDEXED = {Opcode.METADATA_INDEX: Opcode.METADATA, Opcode.ATTACHMENT_INDEX: Opcode.ATTACHMENT}
 STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacked, about
 
 

@@ -122,9 +122,7 @@ def schema_name(scan: Scan, channel: Channel) -> str:
 
 
 def collect(
-    scan: Scan,
-    wanted: Callable[[Series], bool],
-    take: Callable[[Series], None] | None = None,
+    scan: Scan, wanted: Callable[[Series], bool], take: Callable[[Series], None] | None = None
 ) -> dict[str, Series]:
     """Every topic of the file by name; those `wanted` are decoded, the others counted.
 
