@@ -16,7 +16,7 @@ from adapter.effects.active import Active
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.judgement.noise import memory_s
-from adapter.learning.adam import FlatAdam, same_bits
+from adapter.learning.adam import FlatAdam
 from adapter.learning.change import ChangeDetector, explained_share, is_new
 from adapter.learning.imu_schema import ImuSchema
 from adapter.learning.known_effects import KnownEffects, believed, starts_from, told_shapes
@@ -359,7 +359,7 @@ class OnlineLearner:
         begun = self.theta_started_ns is not None and self._shadow is None
         if not begun or self.change.waiting or self.change.each > 1 or not self.theta.steady():
             return 0
-        if (self.rates is not None and not self._rates_known) or not same_bits():
+        if self.rates is not None and not self._rates_known:
             return 0
         return self.schema.steady(table)
 
@@ -386,8 +386,6 @@ class OnlineLearner:
 
     def _parts(self, ahead: int) -> tuple[Any, ...]:
         """What `steps` needs, with so many states ahead for θ."""
-        adam = self.adam
-        moved = adam.parameters, adam.gradient, adam.first, adam.second, adam.steps
         span_ns, waiting, buffer = self._rates.parts
         span_ns = 0 if self.rates is None else span_ns
         return (
@@ -395,7 +393,7 @@ class OnlineLearner:
             self.theta.parts(self.frames, self.theta_converged),
             (span_ns, waiting, np.empty_like(self.theta.theta), buffer, self._which),
             self.change.parts(ahead),
-            (*moved, (adam.rate, *adam.betas)),
+            self.adam.parts(),
         )
 
     def sound(self, table: Array) -> Array:

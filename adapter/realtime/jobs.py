@@ -12,7 +12,6 @@ ring no longer holds is counted as skipped.
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -147,8 +146,6 @@ class LearnerTask:
         board = None if self.snapshot is None else SnapshotWriter.attach(self.snapshot)
         try:
             learner = self.job.make()
-            if "torch" in sys.modules:
-                sys.modules["torch"].set_num_threads(1)
             self._take_over(learner, ring)
             port.ready()
             self._feed(learner, ring, board, port)
