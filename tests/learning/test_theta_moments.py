@@ -17,6 +17,7 @@ from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.kernels import base_at_rest
 from adapter.physics.networks import (
+    FrameMotion,
     regressor,
     theta_from_log_cholesky,
     theta_from_log_cholesky_torch,
@@ -72,7 +73,8 @@ class Case:
 
     def regressor(self) -> np.ndarray:
         """(m, rows, 10 bodies) by the torch network."""
-        signals, base = self.data.joint_signals(), self.data.base.torch()
+        base = FrameMotion.of(self.data.base.rows())
+        signals = tuple(map(torch.from_numpy, self.data.joints()))
         return regressor(self.tree, torch.from_numpy(self.lam), signals, base).numpy()
 
     def states(self, part: slice = slice(None)) -> np.ndarray:
