@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -43,19 +43,13 @@ PUSHES = 100  # read from the loop's board before the posture at their instant i
 HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
 
 
-class LearnerLike(Protocol):
-    """What is fed: every filtered state once, in order. It must copy what it keeps."""
-
-    def step(self, state: Array, /) -> object:
-        """Learn from one record of `StateLayout`."""
-
-
 @dataclass(frozen=True)
 class LearnerJob:
     """The learner process. The callables are top-level functions or partials of such.
 
     Attributes:
-        make: builds the learner there (and imports torch there).
+        make: builds the learner there: whatever has a `step` for a record of `StateLayout`, which
+            it must copy to keep.
         collect: what comes back at the end, picklable.
         publish: the estimate as it stands; None publishes nothing.
         news: what was found so far, for `SnapshotWriter.publish_news`; None says nothing.
@@ -67,7 +61,7 @@ class LearnerJob:
         publish_s, news_s, save_s: how often.
     """
 
-    make: Callable[[], LearnerLike]
+    make: Callable[[], Any]
     collect: Callable[[Any], Any]
     publish: Callable[[Any], Snapshot] | None = None
     news: Callable[[Any], Mapping[str, Any]] | None = None

@@ -16,14 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from adapter.control.controller import Controller
+from adapter.control.controller import ExcitationController
 from adapter.realtime.clock import Clock
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.real_time import DEFAULT_PRIORITY, Grant, RealTime, split_cores
-from adapter.realtime.session import Ended, FrontEndLike, Session, stop_arm
+from adapter.realtime.session import Ended, Session, stop_arm
 from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
+from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, Intake, JointSample
 
 LOOK_EVERY = 256  # ticks between two looks at the workers
@@ -78,7 +79,7 @@ class LiveResult:
         grants: what the operating system granted.
         collected: what the learner's `collect` gave; None without one, or where it died.
         troubles: workers that died or failed, one sentence each.
-        tracking: of the controller, see `Controller.tracking`; None in passive mode.
+        tracking: of the controller, see `ExcitationController.tracking`; None in passive mode.
         intake: the driver's account.
         contacts: what pushed the arm, filled in by whoever knows the arm.
     """
@@ -156,8 +157,8 @@ class Deadman:
 
 def run_live(
     driver: Driver,
-    front_end: FrontEndLike,
-    controller: Controller | None = None,
+    front_end: FrontEnd,
+    controller: ExcitationController | None = None,
     jobs: Jobs | None = None,
     options: LiveOptions | None = None,
     say: Callable[[str], None] = print,
@@ -241,8 +242,8 @@ def run_live(
 
 def _prepare(
     driver: Driver,
-    front_end: FrontEndLike,
-    controller: Controller | None,
+    front_end: FrontEnd,
+    controller: ExcitationController | None,
     supervisor: Supervisor,
     session: Session,
 ) -> None:

@@ -9,14 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any
 
-from adapter.control.controller import Controller
+from adapter.control.controller import ExcitationController
 from adapter.control.sample_clock import SampleClock
 from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
-from adapter.realtime.jobs import LearnerLike
-from adapter.signals.records import StateLayout
+from adapter.realtime.following import FollowingObserver
+from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
 STOP_LIMIT_S = 5.0  # a safe stop that takes longer is left to the driver
@@ -33,26 +33,6 @@ class Ended(StrEnum):
     OPERATOR_GONE = "operator_gone"
     DRIVER_ERROR = "driver_error"
     END_OF_STREAM = "end_of_stream"
-
-
-class FrontEndLike(Protocol):
-    """What turns samples into filtered states; `adapter.signals.front_end.FrontEnd` for one."""
-
-    layout: StateLayout
-
-    def step(self, sample: JointSample) -> Array:
-        """The filtered states (k, size) that this sample completes."""
-
-
-class ObserverLike(Protocol):
-    """Who says what pushes the arm; `adapter.realtime.following.FollowingObserver` for one."""
-
-    @property
-    def alarm(self) -> str | None:
-        """Why a motion has to end; None while all is well."""
-
-    def step(self, sample: JointSample) -> Array:
-        """External torque (n,) N m with this sample."""
 
 
 class Session:
@@ -81,13 +61,13 @@ class Session:
     def __init__(
         self,
         driver: Driver,
-        front_end: FrontEndLike,
-        controller: Controller | None,
+        front_end: FrontEnd,
+        controller: ExcitationController | None,
         pass_on: Callable[[Array], None],
         keep: Callable[[JointSample, Array | None, Array | None], None],
         duration_s: float | None,
     ) -> None:
-        self.observer: ObserverLike | None = None
+        self.observer: FollowingObserver | None = None
         self._driver, self._front_end, self._controller = driver, front_end, controller
         self._pass_on, self._keep, self._duration_s = pass_on, keep, duration_s
         self.samples, self.set_aside, self.elapsed_s = 0, 0, 0.0
@@ -240,9 +220,9 @@ class LockstepResult:
 
 def run_lockstep(
     driver: Driver,
-    front_end: FrontEndLike,
-    learner: LearnerLike | None = None,
-    controller: Controller | None = None,
+    front_end: FrontEnd,
+    learner: Any = None,
+    controller: ExcitationController | None = None,
     duration_s: float | None = None,
     *,
     each: Callable[[JointSample, Array | None], None] | None = None,
@@ -252,7 +232,7 @@ def run_lockstep(
     Args:
         driver: not connected yet; stopped but left open at the end, for questions to it.
         front_end: fresh.
-        learner: takes each filtered state before the next sample is read.
+        learner: its `step` takes each filtered state before the next sample is read.
         controller: moves the arm; None listens.
         duration_s: of the arm's own stamps, until the safe stop begins; None runs to the end of
             the stream.
