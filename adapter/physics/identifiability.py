@@ -50,10 +50,6 @@ class BaseParameters:
     rank: int
     basis: Array
 
-    def of(self, theta: Array) -> Array:
-        """Coordinates (rank,) of parameters in the identifiable subspace."""
-        return self.basis.T @ np.asarray(theta, dtype=np.float64).ravel()
-
     def shown_map(self) -> Array:
         """(columns, columns): of a difference in θ what torques show.
 
@@ -63,10 +59,6 @@ class BaseParameters:
         size = np.tile(BODY_SIZE, len(self.basis) // len(BODY_SIZE))
         rows = np.linalg.qr(self.basis * size[:, None])[0]
         return np.asarray(size[:, None] * (rows @ rows.T) / size)
-
-    def distance(self, first: Array, second: Array) -> float:
-        """Length of the difference that torques can show."""
-        return float(np.linalg.norm(self.of(first) - self.of(second)))
 
 
 @dataclass(frozen=True)
@@ -164,15 +156,14 @@ def _random_base(tree: Tree, gravity: Array, samples: int, seed: int) -> Array:
 
 
 def frame_observability(
-    tree: Tree, lam: Array, gravity: Array, accelerations: bool = True, seed: int = 0
+    tree: Tree, lam: Array, gravity: Array, seed: int = 0
 ) -> FrameObservability:
-    """Observable turns and shifts of every joint frame over random motion.
+    """Turns and shifts of every joint frame that link motion shows over random motion.
 
     Args:
         tree: N and A.
         lam: (n, 6) λ.
         gravity: (3,) in base axes, m/s². A floating base gets random motion of its own.
-        accelerations: whether link accelerations with gravity are seen beside the twists.
         seed: of the motion.
     """
     motion = random_motion(tree, 40, seed)
@@ -182,7 +173,7 @@ def frame_observability(
     bases = []
     for j, i in enumerate(tree.parent):
         parent = np.broadcast_to(base, (len(links), 12)) if i == BASE else links[:, i]
-        matrix = frame_jacobian(parent, motion.dq[:, j], np.asarray(lam)[j], accelerations)
+        matrix = frame_jacobian(parent, motion.dq[:, j], np.asarray(lam)[j])
         _, values, rows = np.linalg.svd(matrix, full_matrices=False)
         shown = values > LEAST_SHOWN * values[0]
         bases.append(rows[shown].T if values[0] >= 1e-9 else np.zeros((6, 0)))
@@ -193,7 +184,7 @@ def frame_observability(
     return FrameObservability(sum(ranks), ranks, projectors, flags, freedom)
 
 
-def frame_jacobian(parent: Array, dq: Array, lam_j: Array, accelerations: bool) -> Array:
+def frame_jacobian(parent: Array, dq: Array, lam_j: Array) -> Array:
     """Change of link j's motion, in the parent's axes, with [turn; shift] of its frame, (.., 6).
 
     R becomes exp(φ) R: what reads Rᵀ x changes by Rᵀ [x ×] φ (eqs. 8a-8d); turning all rows into
@@ -202,19 +193,17 @@ def frame_jacobian(parent: Array, dq: Array, lam_j: Array, accelerations: bool) 
 
     Args:
         parent: (m, 12) motion rows of the parent; dq: (m,) of the joint; lam_j: (6,) its λ.
-        accelerations: whether accelerations are seen beside the twists.
     """
     v, w, a, dw = np.split(parent, 4, axis=1)
     p = lam_j[3:]
     axis = matrix_from_zxz(lam_j[:3])[:, 2]
     zero = np.zeros((len(w), 3, 3))
+    lever = skew(dw) + skew(w) @ skew(w)
+    spin = skew(dw) - dq[:, None, None] * (skew(axis) @ skew(w))
     rows = [
         np.concatenate([skew(v + np.cross(w, p)), skew(w)], axis=2),
         np.concatenate([skew(w), zero], axis=2),
+        np.concatenate([skew(a + lever @ p), lever], axis=2),
+        np.concatenate([spin, zero], axis=2),
     ]
-    if accelerations:
-        lever = skew(dw) + skew(w) @ skew(w)
-        spin = skew(dw) - dq[:, None, None] * (skew(axis) @ skew(w))
-        rows.append(np.concatenate([skew(a + lever @ p), lever], axis=2))
-        rows.append(np.concatenate([spin, zero], axis=2))
     return np.concatenate(rows, axis=1).reshape(-1, 6)

@@ -20,7 +20,7 @@ from adapter.control.controller import ExcitationController
 from adapter.realtime.clock import Clock
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
-from adapter.realtime.real_time import DEFAULT_PRIORITY, Grant, RealTime, split_cores
+from adapter.realtime.real_time import DEFAULT_PRIORITY, RealTime, split_cores
 from adapter.realtime.session import Ended, Session, stop_arm
 from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
@@ -76,7 +76,7 @@ class LiveResult:
         ended: why.
         fault: what the driver or the controller said; None where all was well.
         timing: report.
-        grants: what the operating system granted.
+        grants: what the operating system granted, a sentence each.
         collected: what the learner's `collect` gave; None without one, or where it died.
         troubles: workers that died or failed, one sentence each.
         tracking: of the controller, see `ExcitationController.tracking`; None in passive mode.
@@ -95,7 +95,7 @@ class LiveResult:
     ended: Ended
     fault: str | None
     timing: TimingReport
-    grants: list[Grant]
+    grants: list[str]
     collected: Any
     troubles: list[str]
     tracking: dict[str, Any] | None
@@ -221,7 +221,7 @@ def run_live(
                 options.before_motion(lambda: stop.count > 0)
             with real_time:
                 for grant in real_time.grants:
-                    tell(grant.line)
+                    tell(grant)
                 session.catch_up()
                 try:
                     loop.run(options.duration_s)
@@ -322,7 +322,7 @@ class _Loop:
         self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
 
     def result(
-        self, grants: list[Grant], collected: Any, tracking: dict[str, Any] | None
+        self, grants: list[str], collected: Any, tracking: dict[str, Any] | None
     ) -> LiveResult:
         """What became of the run."""
         session, supervisor = self._session, self._supervisor

@@ -157,7 +157,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         least_squares=batch,
         held=known.held,
         payload=known.payload,
-        changes_ns=tuple(change.stamp_ns for change in learner.changes),
+        changes_ns=tuple(learner.changes),
         rebuilds=learner.rebuilds,
         schema_trace=_course_of_lam(learner),
         schema_known=learner.schema_trace.rows[:, 1 + 12 * learner.tree.n :].copy(),
