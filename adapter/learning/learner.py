@@ -323,12 +323,12 @@ class OnlineLearner:
 
     def _parts(self, ahead: int) -> tuple[Any, ...]:
         """What `steps` needs, with so many states ahead for θ."""
-        span_ns, waiting, buffer = self._rates.parts
+        span_ns, *rates = self._rates.parts
         span_ns = 0 if self.rates is None else span_ns
         return (
             self.schema.parts(),
             self.theta.parts(self.frames, self.theta_converged),
-            (span_ns, waiting, np.empty_like(self.theta.theta), buffer, self._which),
+            (span_ns, *rates, np.empty_like(self.theta.theta), self._which),
             self.change.parts(ahead),
             self.adam.parts(),
         )

@@ -39,6 +39,9 @@ from drivers.files.mcap import FLUSH_S, McapWriter
 from drivers.files.messages import Message
 
 UNFINISHED = "next"
+# How often news are published, and how often a recorder tells an estimate, the links' places and
+# what the loop's timing was meanwhile.
+NEWS_S, ESTIMATE_S, FRAMES_S, TIMING_S = 0.25, 0.1, 1.0 / 30.0, 1.0
 PUSHES = 100  # read from the loop's board before the posture at their instant is known
 HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
 
@@ -57,8 +60,7 @@ class LearnerJob:
         keep: writes the whole state into an empty folder (learner, folder), for a successor if
             this process dies; restore: puts a fresh learner into it. Where None, nobody succeeds.
         effect_names: effects in the published estimate.
-        bodies: rows of θ in it; one per joint where None.
-        publish_s, news_s, save_s: how often.
+        publish_s, save_s: how often.
     """
 
     make: Callable[[], Any]
@@ -69,9 +71,7 @@ class LearnerJob:
     keep: Callable[[Any, Path], None] | None = None
     restore: Callable[[Any, Path], None] | None = None
     effect_names: tuple[str, ...] = ()
-    bodies: int | None = None
     publish_s: float = 0.01
-    news_s: float = 0.25
     save_s: float = 5.0
 
 
@@ -84,17 +84,12 @@ class RecordingJob:
         metadata: configuration, version, ...: written at the start.
         attachments: files to put inside, by name.
         arm: told beside the samples, as documented and as learned; None tells no frames.
-        estimate_s, frames_s, timing_s: how often an estimate, the links' places and what the
-            loop's timing was meanwhile are told.
     """
 
     path: Path
     metadata: Mapping[str, Any] = field(default_factory=dict)
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     arm: ShownArm | None = None
-    estimate_s: float = 0.1
-    frames_s: float = 1.0 / 30.0
-    timing_s: float = 1.0
 
     def part(self, k: int) -> RecordingJob:
         """The same for the k-th successor of a recorder that died: a file of its own."""
@@ -187,7 +182,7 @@ class LearnerTask:
                 fresh, publish_at = False, now + job.publish_s
             if board is not None and job.news is not None and (now >= news_at or drained):
                 board.publish_news(job.news(learner))
-                news_at = now + job.news_s
+                news_at = now + NEWS_S
             if keeping and (now >= keep_at or 2 * ring.kept > ring.rows):
                 self._keep(learner, ring)
                 keep_at = now + job.save_s
@@ -323,7 +318,7 @@ class Beside:
         self._stamp_ns = stamp_ns
         while self._pushes and self._pushes[0].stamp_ns <= stamp_ns:
             self._write(self._messages.push(self._pushes.popleft(), q))
-        if abs(stamp_ns - self._frames_at_ns) < 1e9 * self._job.frames_s:
+        if abs(stamp_ns - self._frames_at_ns) < 1e9 * FRAMES_S:
             return
         self._frames_at_ns = stamp_ns
         self._write(self._messages.frames(stamp_ns, q))
@@ -334,12 +329,12 @@ class Beside:
         """Tell what others know, where it is new; `last` when nothing comes any more."""
         if not self._stamp_ns or not (now >= self._look_at or last):
             return
-        self._look_at = now + self._job.estimate_s
+        self._look_at = now + ESTIMATE_S
         if self._reader is not None:
             self._write(self._messages.estimate(self._reader.read()))
             self._write(self._messages.news(self._stamp_ns, self._reader.read_news()))
         if self._board is not None and (now >= self._timing_at or last):
-            self._timing_at = now + self._job.timing_s
+            self._timing_at = now + TIMING_S
             self._write(self._messages.timing(self._stamp_ns, self._board.timing()))
 
     def _write(self, messages: Iterable[Message]) -> None:

@@ -236,8 +236,7 @@ def run_live(
             if session is not None and supervisor.loop_board is not None:
                 supervisor.loop_board.write_end(session.ended, session.fault)
             collected = supervisor.finish(hurry=lambda: stop.count > 2)
-        tracking = None if controller is None else controller.tracking()
-        return loop.result(real_time.grants, collected, tracking)
+        return loop.result(real_time.grants, collected)
 
 
 def _prepare(
@@ -321,9 +320,7 @@ class _Loop:
         ended_ns = time.monotonic_ns()
         self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
 
-    def result(
-        self, grants: list[str], collected: Any, tracking: dict[str, Any] | None
-    ) -> LiveResult:
+    def result(self, grants: list[str], collected: Any) -> LiveResult:
         """What became of the run."""
         session, supervisor = self._session, self._supervisor
         return LiveResult(
@@ -341,6 +338,6 @@ class _Loop:
             grants=grants,
             collected=collected,
             troubles=supervisor.troubles,
-            tracking=tracking,
+            tracking=session.tracking,
             intake=copy.deepcopy(self._driver.intake),
         )

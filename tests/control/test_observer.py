@@ -10,12 +10,13 @@ import pytest
 
 from adapter.control.observer import ContactObserver
 from adapter.realtime.following import FollowingObserver
-from adapter.realtime.snapshot import SnapshotReader, SnapshotWriter, nothing_known
+from adapter.realtime.snapshot import SnapshotReader, SnapshotWriter
 from adapter.runs.contacts import Kind, kind_of
 from drivers.interface import JointSample
 from sim.effects import payload
 from sim.truth import panda
 from tests.helpers.arm_data import Motion, arm, panda_model, pin_model, record, rnea
+from tests.helpers.live_learners import nothing_known
 
 STD = np.full(7, 0.05)
 NONE = np.zeros((0, 7))
