@@ -100,7 +100,7 @@ def numerical_rank(matrix: Array, tolerance: float = RANK_TOLERANCE) -> tuple[in
     return rank, np.asarray(basis, dtype=np.float64)
 
 
-def random_motion(tree: Tree, samples: int, seed: int) -> JointMotion:
+def random_motion(tree: Tree, samples: int, seed: int = 0) -> JointMotion:
     """Independent random joint states that excite everything a joint can."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(-np.pi, np.pi, (samples, tree.n))
@@ -108,14 +108,14 @@ def random_motion(tree: Tree, samples: int, seed: int) -> JointMotion:
 
 
 def random_regressor(
-    tree: Tree, lam: Array, gravity: Array, samples: int, seed: int = 0, wrench: bool = True
+    tree: Tree, lam: Array, gravity: Array, samples: int, wrench: bool = True
 ) -> tuple[JointMotion, Array]:
     """Random motion, and the regressor (samples, rows, 10 bodies) over it.
 
-    Arguments as of `base_parameters`.
+    Arguments as of `base_parameters`; wrench: whether that on a floating base is known.
     """
-    motion = random_motion(tree, samples, seed)
-    base = _random_base(tree, gravity, samples, seed)
+    motion = random_motion(tree, samples)
+    base = _random_base(tree, gravity, samples)
     matrix = np.empty((samples, tree.rows, 10 * tree.bodies))
     regressors(frames_of(tree.parent, lam), motion, base, matrix)
     return motion, matrix if wrench else matrix[:, tree.rows - tree.n :]
@@ -125,9 +125,7 @@ def base_parameters(
     tree: Tree,
     lam: Array,
     gravity: Array,
-    seed: int = 0,
     extra: ExtraColumns | None = None,
-    wrench: bool = True,
 ) -> BaseParameters:
     """The identifiable subspace of θ, from the regressor over random motion.
 
@@ -135,39 +133,34 @@ def base_parameters(
         tree: N and A.
         lam: (n, 6) λ.
         gravity: (3,) in base axes, m/s². A floating base gets random motion of its own.
-        seed: of the motion.
         extra: columns of further effects to be counted beside θ (friction, offsets, ...).
-        wrench: whether the wrench on a floating base is known.
     """
     samples = max(20, 4 * 10 * tree.bodies // tree.rows + 10)
-    motion, matrix = random_regressor(tree, lam, gravity, samples, seed, wrench)
+    motion, matrix = random_regressor(tree, lam, gravity, samples)
     if extra is not None:
         matrix = np.concatenate([matrix, extra(*motion)], axis=2)
     rank, basis = numerical_rank(matrix.reshape(-1, matrix.shape[2]))
     return BaseParameters(rank, basis)
 
 
-def _random_base(tree: Tree, gravity: Array, samples: int, seed: int) -> Array:
+def _random_base(tree: Tree, gravity: Array, samples: int) -> Array:
     """Motion rows (samples, 12) of a floating base, or (1, 12) of one at rest."""
     if not tree.floating:
         return base_at_rest(gravity)[None]
-    rng = np.random.default_rng(seed + 1)
+    rng = np.random.default_rng(1)
     return np.concatenate([rng.normal(size=(samples, 3)) for _ in range(4)], axis=1)
 
 
-def frame_observability(
-    tree: Tree, lam: Array, gravity: Array, seed: int = 0
-) -> FrameObservability:
+def frame_observability(tree: Tree, lam: Array, gravity: Array) -> FrameObservability:
     """Turns and shifts of every joint frame that link motion shows over random motion.
 
     Args:
         tree: N and A.
         lam: (n, 6) λ.
         gravity: (3,) in base axes, m/s². A floating base gets random motion of its own.
-        seed: of the motion.
     """
-    motion = random_motion(tree, 40, seed)
-    base = _random_base(tree, gravity, len(motion.q), seed)
+    motion = random_motion(tree, 40)
+    base = _random_base(tree, gravity, len(motion.q))
     links = np.empty((*motion.q.shape, 12))
     link_motions(frames_of(tree.parent, lam), motion, base, links)
     bases = []

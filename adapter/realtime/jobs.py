@@ -14,7 +14,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -114,6 +114,30 @@ class Jobs:
     view: DisplayJob | None = None
 
 
+def drain(
+    ring: Ring, port: Port, take: Callable[[Array], object]
+) -> Iterator[tuple[int, float, bool]]:
+    """Hand records to `take` until the ring is finished and drained, or nobody is left.
+
+    What is taken is a copy: nobody sees memory that the loop writes to. Yields again and again how
+    many were taken, the time, and whether nothing comes any more.
+    """
+    own, drained = np.zeros(ring.size), False
+    while not drained:
+        finished = ring.finished
+        rows = ring.peek(ROWS_AT_ONCE)
+        for row in rows:
+            own[:] = row
+            take(own)
+        count = len(rows)
+        del rows
+        ring.take(count)
+        drained = not count and (finished or port.orphaned)
+        yield count, time.monotonic(), drained
+        if not count and not drained:
+            time.sleep(IDLE_S)
+
+
 @dataclass(frozen=True)
 class LearnerTask:
     """Run by the learner process.
@@ -159,23 +183,12 @@ class LearnerTask:
     def _feed(self, learner: Any, ring: Ring, board: SnapshotWriter | None, port: Port) -> None:
         job = self.job
         keeping = self.keep_in is not None and job.keep is not None
-        own = np.zeros(ring.size)  # the learner never sees memory that the loop writes to
         fresh, publish_at, news_at = False, 0.0, 0.0
         save_at = keep_at = time.monotonic() + job.save_s
-        while True:
-            finished = ring.finished
-            rows = ring.peek(ROWS_AT_ONCE)
-            for row in rows:
-                own[:] = row
-                learner.step(own)
-            count = len(rows)
-            del rows
-            ring.take(count)
+        for count, now, drained in drain(ring, port, learner.step):
             if not keeping:
                 ring.give_back()
             fresh = fresh or count > 0
-            now = time.monotonic()
-            drained = not count and (finished or port.orphaned)
             due = fresh and (now >= publish_at or drained)
             if due and board is not None and job.publish is not None:
                 board.publish(job.publish(learner))
@@ -189,10 +202,6 @@ class LearnerTask:
             if job.save is not None and (now >= save_at or drained):
                 job.save(learner)
                 save_at = now + job.save_s
-            if drained:
-                return
-            if not count:
-                time.sleep(IDLE_S)
 
     def _keep(self, learner: Any, ring: Ring) -> None:
         """Keep a state, then give back what it has learned and remove those before it."""
@@ -255,35 +264,25 @@ class RecorderTask:
 
     def _drain(self, writer: McapWriter, ring: Ring, beside: Beside, port: Port) -> int:
         layout = RawLayout(len(self.joint_names), len(self.link_names))
-        own, written = layout.new(), 0
-        flush_at = time.monotonic()
-        while True:
-            finished = ring.finished
-            rows = ring.peek(ROWS_AT_ONCE)
-            for row in rows:
-                own[:] = row
-                sample, command, external = layout.sample(own)
-                writer.write(sample)
-                if command is not None:
-                    writer.write_command(sample.stamp_ns, command)
-                if external is not None:
-                    writer.write_external(sample.stamp_ns, external)
-                beside.sample(sample.stamp_ns, sample.q)
-            count = len(rows)
-            del rows
-            ring.take(count)
+        flush_at, written = time.monotonic(), 0
+
+        def write(record: Array) -> None:
+            sample, command, external = layout.sample(record)
+            writer.write(sample)
+            if command is not None:
+                writer.write_command(sample.stamp_ns, command)
+            if external is not None:
+                writer.write_external(sample.stamp_ns, external)
+            beside.sample(sample.stamp_ns, sample.q)
+
+        for count, now, drained in drain(ring, port, write):
             written += count
-            now = time.monotonic()
-            drained = not count and (finished or port.orphaned)
             beside.look(now, drained)
             if now >= flush_at or 2 * ring.kept > ring.rows:
                 writer.flush()
                 ring.give_back()
                 flush_at = now + HAND_OVER_S
-            if drained:
-                return written
-            if not count:
-                time.sleep(IDLE_S)
+        return written
 
 
 class Beside:
