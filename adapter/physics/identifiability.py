@@ -108,14 +108,14 @@ def random_motion(tree: Tree, samples: int, seed: int = 0) -> JointMotion:
 
 
 def random_regressor(
-    tree: Tree, lam: Array, gravity: Array, samples: int, wrench: bool = True
+    tree: Tree, lam: Array, gravity: Array, samples: int, seed: int = 0, wrench: bool = True
 ) -> tuple[JointMotion, Array]:
     """Random motion, and the regressor (samples, rows, 10 bodies) over it.
 
     Arguments as of `base_parameters`; wrench: whether that on a floating base is known.
     """
-    motion = random_motion(tree, samples)
-    base = _random_base(tree, gravity, samples)
+    motion = random_motion(tree, samples, seed)
+    base = _random_base(tree, gravity, samples, seed)
     matrix = np.empty((samples, tree.rows, 10 * tree.bodies))
     regressors(frames_of(tree.parent, lam), motion, base, matrix)
     return motion, matrix if wrench else matrix[:, tree.rows - tree.n :]
@@ -143,11 +143,11 @@ def base_parameters(
     return BaseParameters(rank, basis)
 
 
-def _random_base(tree: Tree, gravity: Array, samples: int) -> Array:
+def _random_base(tree: Tree, gravity: Array, samples: int, seed: int = 0) -> Array:
     """Motion rows (samples, 12) of a floating base, or (1, 12) of one at rest."""
     if not tree.floating:
         return base_at_rest(gravity)[None]
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed + 1)
     return np.concatenate([rng.normal(size=(samples, 3)) for _ in range(4)], axis=1)
 
 
