@@ -13,7 +13,7 @@ import numpy as np
 
 from adapter.errors import ModelError, SettingsError
 from adapter.judgement.noise import memory_s
-from adapter.learning.adam import FlatAdam
+from adapter.learning.adam import FlatAdam, same_bits
 from adapter.learning.change import ChangeDetector, explained_share, is_new
 from adapter.learning.imu_schema import ImuSchema
 from adapter.learning.known_effects import KnownEffects, starts_from
@@ -296,7 +296,7 @@ class OnlineLearner:
         begun = self.theta_started_ns is not None and self._shadow is None
         if not begun or self.change.waiting or self.change.each > 1 or not self.theta.steady():
             return 0
-        if self.rates is not None and not self._rates_known:
+        if (self.rates is not None and not self._rates_known) or not same_bits():
             return 0
         return self.schema.steady(table)
 
@@ -323,6 +323,8 @@ class OnlineLearner:
 
     def _parts(self, ahead: int) -> tuple[Any, ...]:
         """What `steps` needs, with so many states ahead for θ."""
+        adam = self.adam
+        moved = adam.parameters, adam.gradient, adam.first, adam.second, adam.steps
         span_ns, *rates = self._rates.parts
         span_ns = 0 if self.rates is None else span_ns
         return (
@@ -330,7 +332,7 @@ class OnlineLearner:
             self.theta.parts(self.frames, self.theta_converged),
             (span_ns, *rates, np.empty_like(self.theta.theta), self._which),
             self.change.parts(ahead),
-            self.adam.parts(),
+            (*moved, (adam.rate, *adam.betas)),
         )
 
     def sound(self, table: Array) -> Array:

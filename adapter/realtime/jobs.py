@@ -12,6 +12,7 @@ ring no longer holds is counted as skipped.
 from __future__ import annotations
 
 import shutil
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -159,6 +160,8 @@ class LearnerTask:
         board = None if self.snapshot is None else SnapshotWriter.attach(self.snapshot)
         try:
             learner = self.job.make()
+            if "torch" in sys.modules:
+                sys.modules["torch"].set_num_threads(1)
             self._take_over(learner, ring)
             port.ready()
             self._feed(learner, ring, board, port)

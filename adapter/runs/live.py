@@ -98,17 +98,21 @@ class LiveScreen:
         return self._verdict
 
 
-def watched_learner(
+def single_thread_learner(
     documented: SelfModel,
     settings: PipelineSettings,
     resume: Path | None,
     aloud: bool = False,
     trusted: bool = False,
 ) -> OnlineLearner:
-    """A learner with a monitor that looks over its shoulder and a screen that judges the torques.
+    """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit.
 
-    `aloud`, they tell at once what they find. `trusted` torques are not refused.
+    A monitor looks over its shoulder, and the screen of recordings judges the torques; `aloud`,
+    they tell at once what they find. `trusted` torques are not refused.
     """
+    import torch
+
+    torch.set_num_threads(1)
     learner = make_learner(documented, settings)
     delay_s = make_front_end(documented, settings).delay_s
     tool = None if documented.tool is None else documented.tool.theta()
@@ -139,7 +143,7 @@ def learner_job(
         trusted: torques that are not those of the model are learned all the same.
     """
     return LearnerJob(
-        make=partial(watched_learner, documented, settings, resume, aloud, trusted),
+        make=partial(single_thread_learner, documented, settings, resume, aloud, trusted),
         collect=collect_judged,
         publish=Publisher(),
         news=news_of,

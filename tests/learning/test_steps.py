@@ -8,6 +8,7 @@ import pytest
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.learning import learner as learner_module
+from adapter.learning.adam import same_bits
 from adapter.learning.checkpoint import save_checkpoint
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import Mode
@@ -62,7 +63,8 @@ def test_the_same_bits(hidden: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert [key for key, x in ours.items() if not same(x, theirs[key])] == []
     assert many.refused == one.refused == 2 and many.learned == len(states(hidden)) - 2
     assert len(many.changes) == (hidden == "load")
-    assert together > 0.2 * many.learned  # λ of noisy links takes most of the time
+    if same_bits():  # else every state is a step of its own
+        assert together > 0.2 * many.learned  # λ of noisy links takes most of the time
 
 
 def same(a: np.ndarray, b: np.ndarray) -> bool:

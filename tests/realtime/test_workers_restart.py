@@ -14,7 +14,7 @@ from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
 from adapter.realtime.session import run_lockstep
 from adapter.runs.config import PipelineSettings
-from adapter.runs.live import learner_job, watched_learner
+from adapter.runs.live import learner_job, single_thread_learner
 from adapter.runs.outcome import collect
 from tests.helpers import live_tools as tools
 
@@ -94,7 +94,7 @@ def test_one_that_always_dies_is_given_up(tmp_path):
 
 def _mortal_learner(documented, settings):
     """The real learner; killed after so many states."""
-    learner = watched_learner(documented, settings, None)
+    learner = single_thread_learner(documented, settings, None)
     step, deaths = learner.step, os.environ["TEST_DEATHS"].split()
 
     def step_or_die(record) -> None:
@@ -122,7 +122,7 @@ def test_the_real_learner_goes_on_bit_for_bit(monkeypatch):
     )
     assert (result.ended, result.restarts, result.skipped) == ("duration", 1, 0)
 
-    whole = watched_learner(tools.PANDA, settings, None)
+    whole = single_thread_learner(tools.PANDA, settings, None)
     front_end, controller = tools.parts()
     run_lockstep(tools.simulated_arm(), front_end, whole, controller, duration_s)
     expected, found = collect(whole), result.collected

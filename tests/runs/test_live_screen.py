@@ -34,7 +34,7 @@ class OtherSign(PyBulletArm):
 @pytest.mark.parametrize("driver", [OtherSign, PyBulletArm])
 def test_the_verdict_comes_first(driver, capsys, tmp_path) -> None:
     settings = PipelineSettings()
-    learner = live.watched_learner(PANDA, settings, None, aloud=True)
+    learner = live.single_thread_learner(PANDA, settings, None, aloud=True)
     front_end, publish, seen = make_front_end(PANDA, settings), live.Publisher(), []
 
     class Published:
@@ -64,6 +64,6 @@ def test_the_verdict_comes_first(driver, capsys, tmp_path) -> None:
     np.testing.assert_array_equal(data.model.theta, PANDA.theta)
     assert data.model.provenance["refusal"] == numbers["torques"]["refusal"]
     live.keep_learner(learner, tmp_path)
-    heir = live.watched_learner(PANDA, settings, None)
+    heir = live.single_thread_learner(PANDA, settings, None)
     live.restore_learner(heir, tmp_path)
     assert heir.screen.judge() == learner.verdict

@@ -30,7 +30,7 @@ from adapter.realtime.showing import Looker, View
 from adapter.realtime.snapshot import ExternalTorque, SnapshotReader, SnapshotWriter
 from adapter.realtime.timing import Histogram, Timing
 from adapter.runs.config import PipelineSettings
-from adapter.runs.live import FIRST_S, Publisher, news_of, watched_learner
+from adapter.runs.live import FIRST_S, Publisher, news_of, single_thread_learner
 from adapter.runs.pipeline import make_front_end
 from adapter.signals.records import stamp_of
 from adapter.view import foxglove_view
@@ -82,7 +82,7 @@ def seen_run(seconds: float) -> Seen:
     """Drive the simulated arm, learn, publish, look: all of it real, in one thread."""
     pipeline = PipelineSettings(learner=LearnerSettings(effects=FRICTION))
     known = KnownRun(PANDA, FRICTION, "pybullet:panda", seconds, "a run")
-    learner, publish = watched_learner(PANDA, pipeline, None), Publisher()
+    learner, publish = single_thread_learner(PANDA, pipeline, None), Publisher()
     front_end, controller = make_front_end(PANDA, pipeline), parts()[1]
     ring = Ring.create(front_end.layout.size, 4000)
     names = PANDA.tree.joint_names
