@@ -27,8 +27,6 @@ from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching, present
 from drivers.files.mcap import Log, read_log
 
-PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
-
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
@@ -94,9 +92,7 @@ def _figures(
         front_end.refused,
         front_end.first_moving_ns,
         front_end.delay_s,
-        dict.fromkeys(PERCENTILES)
-        if not result.ticks.count
-        else {k: 1e-3 * result.ticks.percentile_ns(share) for k, share in PERCENTILES.items()},
+        result.ticks.summary_us(),
     )
     return figures(
         result.outcome,

@@ -405,7 +405,7 @@ def _conclude(
         scenario=args.scenario,
         program=f"panda-adapter {program_version()}",
         timing=result.timing.as_dict(),
-        granted=[grant.line for grant in result.grants],
+        granted=result.grants,
         ended=result.ended,
         fault=result.fault,
         intake=result.intake.as_dict(),

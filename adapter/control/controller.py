@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from adapter.control.feedforward import Feedforward
 from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.observer import ContactObserver
 from adapter.control.path_motion import PathMotion, smooth_step
-from adapter.control.reading_gate import ReadingGate, ReadingJudge
+from adapter.control.reading_gate import ReadingGate
 from adapter.control.resting import CarriedWeight
 from adapter.control.safety import ArmWatch, Now
 from adapter.control.settings import ExcitationSettings, SafetySettings
@@ -39,36 +39,6 @@ START_REACH = 0.02  # rad, further from where the motion was drawn from it does 
 FADE_S = 1.0  # from feedback alone to feed-forward
 REFRESH_TICKS = 50
 CARRY_TICKS = 20  # between two looks at what carries the arm
-
-
-class Controller(Protocol):
-    """What the loop asks of a controller."""
-
-    @property
-    def at_rest(self) -> bool:
-        """A stop was asked for and is done."""
-
-    def attach(self, snapshot_name: str) -> None:
-        """Follow the estimate published under this name."""
-
-    def detach(self) -> None:
-        """Follow it no longer."""
-
-    def attend(self, driver: Driver) -> None:
-        """Get to know the arm; called before `prepare`, once it is connected."""
-
-    def prepare(self, sample: JointSample) -> None:
-        """Get ready to start from where this sample finds the arm; may take its time."""
-
-    def step(self, sample: JointSample, now_ns: int = 0) -> Array:
-        """Torques (n,) N m for this sample, handled at `now_ns` (0: not known). Raises
-        ControlError."""
-
-    def begin_stop(self) -> None:
-        """Come to rest from now on; `step` goes on being called."""
-
-    def tracking(self) -> dict[str, Any]:
-        """How well the arm followed, JSON values only."""
 
 
 @dataclass(frozen=True)
@@ -235,20 +205,17 @@ class ExcitationController:
         self._tau = self._bias = np.array(own, dtype=np.float64)
         if self.weight is not None:
             self.weight.begin(sample.q, sample.tau)
-        self._gate = ReadingGate(self._new_judge(), self._period_ns)
+        limits = self.limits
+        self._gate = ReadingGate(limits.velocity, limits.effort, self._K, self._period_ns)
         self._watch = ArmWatch(self.limits, self.safety, self._K, self._effort)
         self._started = False
         ref.advance(0.0)  # compiles, as do the next lines, before the clock runs
-        self._new_judge().judge(ref.q, ref.dq, ref.q, (0.0, 0.0))
         if self.feedforward is not None:
             self.feedforward(ref.q, ref.dq, ref.ddq)
         if self._expected is not None:
             self._expected(ref.q, ref.dq, ref.ddq)
             if self._adds_gravity:
                 self._watch.now[Now.CARRIED] = self._expected.unbent(ref.q)
-
-    def _new_judge(self) -> ReadingJudge:
-        return ReadingJudge(self.limits.velocity, self.limits.effort, self._K)
 
     def begin_stop(self) -> None:
         """Slow down along the path, then hold."""

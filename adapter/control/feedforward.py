@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -28,19 +27,16 @@ from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, torques, wrench_torques
 
 
-class Feedforward(Protocol):
-    """What a controller asks of a model.
+class Feedforward:
+    """What a controller asks of a model, here of one that is not learned.
 
     Attributes:
         ready: whether its torques may be used.
         notes: what the user should be told of it.
     """
 
-    @property
-    def ready(self) -> bool: ...
-
-    @property
-    def notes(self) -> Sequence[str]: ...
+    ready = True
+    notes: Sequence[str] = ()
 
     def attach(self, name: str) -> None:
         """Follow the estimate published under this name, where the model is a learned one."""
@@ -53,9 +49,11 @@ class Feedforward(Protocol):
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion (n,) rad, rad/s, rad/s². Raises nothing."""
+        raise NotImplementedError
 
     def unbent(self, q: Array) -> Array:
         """Torques (n,) N m of holding still with nothing bent: gravity. Raises nothing."""
+        raise NotImplementedError
 
 
 def not_learned(documented: SelfModel, effect_names: Sequence[str]) -> list[Active]:
@@ -65,7 +63,7 @@ def not_learned(documented: SelfModel, effect_names: Sequence[str]) -> list[Acti
     return [active for active in lasting if active.effect.name not in effect_names]
 
 
-class ModelFeedforward:
+class ModelFeedforward(Feedforward):
     """Inverse dynamics of a fixed-base model, compiled; some 5 µs a call for 7 joints.
 
     What a model's effects do to a motion is computed from one instant: the links follow the
@@ -88,8 +86,6 @@ class ModelFeedforward:
         table: (`Row`, n) of its joints.
         odd: whether any effect is none that `table` can hold: `beside` then says its torque.
     """
-
-    notes: Sequence[str] = ()
 
     def __init__(
         self,
@@ -124,20 +120,6 @@ class ModelFeedforward:
         forward = cls(model.tree, model.gravity, known=known)
         forward.set(model.lam, model.theta_with_tool(), np.zeros((0, model.tree.n)))
         return forward
-
-    @property
-    def ready(self) -> bool:
-        """A model is always ready."""
-        return True
-
-    def attach(self, name: str) -> None:
-        """This model is not learned."""
-
-    def detach(self) -> None:
-        """Nothing to let go."""
-
-    def refresh(self) -> None:
-        """Nothing is ever new."""
 
     def set(
         self, lam: Array, theta: Array, effect_values: Array, shapes: Array | None = None

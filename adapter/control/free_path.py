@@ -23,7 +23,7 @@ from adapter.control.limits import MotionLimits
 from adapter.control.meshes import Mesh, read_mesh
 from adapter.control.path_motion import PathMotion
 from adapter.control.settings import ExcitationSettings
-from adapter.control.shapes import Body, Capsule, bodies_of
+from adapter.control.shapes import Body, bodies_of
 from adapter.errors import MeansError, SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_rpy, z_to_axis
@@ -195,7 +195,7 @@ class ArmInCell:
 
     def _shape(self, body: Body) -> tuple[Any, Array, Array]:
         """Shape, and its turn and place in the link's frame."""
-        if not isinstance(body, Capsule):
+        if body.triangles is not None:
             points, triangles = self._listed(Mesh(body.ends, body.triangles))
             return self._coal.Convex(points, triangles), np.eye(3), np.zeros(3)
         line = body.ends[1] - body.ends[0]

@@ -18,7 +18,7 @@ import numpy as np
 from adapter.effects.base import LearnedEffect
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import effects_by_name
-from adapter.model.inertia import PARAMETERS
+from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import BODY_SIZE, base_parameters
@@ -175,10 +175,11 @@ class Information:
         return out
 
     def _names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        tree, names, units = self._model.tree, [], []
+        tree, names = self._model.tree, list[str]()
+        units: list[str] = []
         for link in tree.link_names:
             names += [f"{link} {part}" for part in PARAMETERS]
-            units += ["kg", *["kg m"] * 3, *["kg m²"] * 6]
+            units += UNITS
         for effect in self._effects:
             names += [f"{joint} {effect.key}" for joint in tree.joint_names]
             units += [effect.unit] * tree.n

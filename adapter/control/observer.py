@@ -11,7 +11,7 @@ model: the documented one, or what is learned at the moment.
 
 How far r may be off without a contact: what the model leaves unexplained, what friction may do
 around a turn of a joint, and the observer's own noise, which it measures by itself. A contact is
-where r leaves that by `sigmas` over all joints together.
+where r leaves that by `SIGMAS` over all joints together.
 """
 
 from __future__ import annotations
@@ -27,12 +27,15 @@ from numpy.typing import NDArray
 from adapter.control.feedforward import ModelFeedforward, not_learned
 from adapter.control.instant import Row, beside, wind_table
 from adapter.effects.active import with_bodies
-from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import Frames, axis_line, borrowed, jit, momenta, place_frames
 from drivers.interface import JointSample
 
+POLE = 2.0 * math.pi * 24.0  # rad/s, of each of the observer's two
+# Standard deviations, over all joints together, beyond which it is a contact; s over which the mean
+# has to fall below half of that until the contact is over.
+SIGMAS, HOLD_S = 8.0, 0.1
 LONGEST_S = 0.02  # a longer step of the stamps begins anew
 SLOW_S, NOISE_S = 0.3, 5.0  # what is slower is no noise; over which noise is measured
 AGO_NS, LONG_AGO_S = 15_000_000, 0.1  # readings before, between which a momentum's rate is taken
@@ -46,26 +49,6 @@ UNLEARNED_EFFORT, UNLEARNED_WEIGHT = 0.02, 0.05
 NOT_KNOWN = np.array([100.0, 100.0, 100.0, 30.0, 30.0, 30.0])  # std of a wrench, N, N m
 MOST_CONTACTS = 1000
 SEEN, SEEN_EVERY = 60, 5  # samples of a contact that are kept to tell what it is
-
-
-@dataclass(frozen=True)
-class ObserverSettings:
-    """How contacts are told from what the model does not know.
-
-    Attributes:
-        bandwidth_hz: of each of the observer's two poles.
-        sigmas: standard deviations, over all joints together, beyond which it is a contact.
-        hold_s: over which the mean has to fall below half of that until the contact is over.
-    """
-
-    bandwidth_hz: float = 24.0
-    sigmas: float = 8.0
-    hold_s: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name in ("bandwidth_hz", "sigmas", "hold_s"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"observer.{name} must be above zero")
 
 
 class Of(IntEnum):
@@ -331,9 +314,8 @@ class ContactObserver:
         self,
         documented: SelfModel,
         effect_names: Sequence[str] = (),
-        settings: ObserverSettings | None = None,
     ) -> None:
-        self.settings, n = settings or ObserverSettings(), documented.tree.n
+        n = documented.tree.n
         effort = documented.limits.effort
         self._model = ModelFeedforward.of(documented)
         self._learned = ModelFeedforward(
@@ -343,7 +325,6 @@ class ContactObserver:
             not_learned(documented, effect_names),
         )
         self._tool = documented.theta_with_tool() - documented.theta
-        self._pole = 2.0 * math.pi * self.settings.bandwidth_hz
         self._table = table = np.zeros((Of.NOISE + n, n))
         self.torque, self.std, self.distance = table[Of.TORQUE], table[Of.STD], 0.0
         self.std[:], self.expected, self.explained = np.inf, table[Of.EXPECTED], np.zeros(n)
@@ -369,7 +350,7 @@ class ContactObserver:
         joints = self._model.table.copy()
         ask(self._bodies, joints, table, True, 1e-3)
         past = np.zeros(2, dtype=np.int64), np.zeros((2, 2, n))
-        how = self._pole, self.settings.sigmas, True, True
+        how = POLE, SIGMAS, True, True
         readings = self._stamps, self._signals
         observe_each(self._bodies, joints, table, readings, ((0, 0.0, True), how), past)
         hand_wrench(self.frames, 0.0 * one, 0.0 * one, one, np.zeros((2, 6)))
@@ -459,7 +440,7 @@ class ContactObserver:
             q, dq = signals[0, 0], signals[0, 1]
             self._table[Of.ODD] = model.odd_beside(q, dq, dt_s if known else math.inf)
         stands = self._stamp_ns, self._age_s, self._anew
-        how = self._pole, self.settings.sigmas, self.contact is None, not model.odd
+        how = POLE, SIGMAS, self.contact is None, not model.odd
         now, readings = (stands, how), (stamp_ns, signals)
         count, stands, distance, dt_s = observe_each(
             self._bodies, model.table, self._table, readings, now, self._past
@@ -473,7 +454,7 @@ class ContactObserver:
 
     def _judge(self, stamp_ns: int, signals: Array, dt_s: float) -> None:
         """Begin, follow and end a contact, with a sample q, dq, tau (3, n)."""
-        contact, limit = self.contact, self.settings.sigmas
+        contact, limit = self.contact, SIGMAS
         if contact is None:
             if self.distance > limit:
                 joint = int(np.argmax(np.abs(self.torque) / self.std))
@@ -482,7 +463,7 @@ class ContactObserver:
                 if len(self.contacts) < MOST_CONTACTS:
                     self.contacts.append(contact)
             return
-        keep = math.exp(-dt_s / self.settings.hold_s)
+        keep = math.exp(-dt_s / HOLD_S)
         self._recent = keep * self._recent + (1.0 - keep) * self.distance**2
         if self._recent < 0.25 * limit * limit:
             contact.end_ns, self.contact = stamp_ns, None

@@ -38,9 +38,6 @@ class ReadingVerdict(IntEnum):
     BROKEN_OFF = 5  # a jump behind a hole: of all samples, or of this joint's
 
 
-VERDICTS = tuple(ReadingVerdict)
-
-
 @jit
 def judge_reading(q, dq, q_ref, between_s, bounds, last):
     """(verdict, joint) on a reading; `last` is overwritten if it is good.
@@ -90,40 +87,6 @@ def judge_reading(q, dq, q_ref, between_s, bounds, last):
     return ReadingVerdict.GOOD.value, 0
 
 
-class ReadingJudge:
-    """Judges readings one after the other.
-
-    Args:
-        velocity: (n,) documented speeds, rad/s.
-        effort: (n,) limits, N m (may be infinite); stiffness: (n,) of the controller, N m/rad.
-
-    Attributes:
-        joint: index of the joint that the last verdict is about.
-    """
-
-    def __init__(self, velocity: Array, effort: Array, stiffness: Array) -> None:
-        n = len(velocity)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            wind = STUCK_EFFORT * np.asarray(effort) / stiffness
-        wind = np.where(np.isfinite(wind), wind, np.inf)
-        self._bounds = np.array([velocity, wind], dtype=np.float64)
-        self._last = np.full((4, n), np.nan)
-        self._last[3] = 0.0
-        self.joint = 0
-
-    def judge(
-        self, q: Array, dq: Array, q_ref: Array, between_s: tuple[float, float]
-    ) -> ReadingVerdict:
-        """What a reading is, by its numbers: one of the first four.
-
-        Args:
-            q, dq: (n,) the reading; q_ref: (n,) the reference.
-            between_s: (least, most) time since the last good reading.
-        """
-        verdict, self.joint = judge_reading(q, dq, q_ref, between_s, self._bounds, self._last)
-        return VERDICTS[verdict]
-
-
 _WHY = {
     ReadingVerdict.NON_FINITE: f"no usable joint reading {_SINCE}",
     ReadingVerdict.GOOD: f"no usable joint reading {_SINCE}",
@@ -142,15 +105,24 @@ class ReadingGate:
     """Takes every sample; says how far time went and whether its reading may be acted upon.
 
     Args:
-        judge: of the numbers.
+        velocity: (n,) documented speeds, rad/s.
+        effort: (n,) limits, N m (may be infinite); stiffness: (n,) of the controller, N m/rad.
         period_ns: of the arm.
 
     Attributes:
         unusable: readings that may not be acted upon.
     """
 
-    def __init__(self, judge: ReadingJudge, period_ns: int) -> None:
-        self._judge, self._period_ns = judge, period_ns
+    def __init__(self, velocity: Array, effort: Array, stiffness: Array, period_ns: int) -> None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            wind = STUCK_EFFORT * np.asarray(effort) / stiffness
+        wind = np.where(np.isfinite(wind), wind, np.inf)
+        self._bounds = np.array([velocity, wind], dtype=np.float64)
+        self._last, self._joint = np.full((4, len(velocity)), np.nan), 0
+        self._last[3] = 0.0
+        still = np.zeros(len(velocity))  # compiled now, not in the first tick
+        judge_reading(still, still, still, (0.0, 0.0), self._bounds, self._last.copy())
+        self._period_ns = period_ns
         self._clock = SampleClock(period_ns, LONGEST_STEP_NS)
         self._started = self._leapt = False
         self.unusable = 0
@@ -180,16 +152,17 @@ class ReadingGate:
         verdict = ReadingVerdict.REPEATED
         if self._clock.fresh:
             times = 1e-9 * self._handled_ns, 1e-9 * self._stamped_ns
-            between_s = min(times), max(times)
-            verdict = self._judge.judge(sample.q, sample.dq, q_ref, between_s)
+            reading = sample.q, sample.dq, q_ref, (min(times), max(times))
+            found, self._joint = judge_reading(*reading, self._bounds, self._last)
+            verdict = ReadingVerdict(found)
         unmeasured = np.isnan(sample.tau)  # what a driver predicts has no torque
         if self._unmeasured is not None:
             self._unmeasured |= unmeasured
-            hole = self._leapt or bool(self._unmeasured[self._judge.joint])
+            hole = self._leapt or bool(self._unmeasured[self._joint])
             if verdict == ReadingVerdict.JUMPED and hole:
                 verdict = ReadingVerdict.BROKEN_OFF
         if self._blind_ns > BLIND_NS or verdict == ReadingVerdict.STUCK:
-            raise ControlError(_WHY[verdict].format(self._judge.joint + 1))
+            raise ControlError(_WHY[verdict].format(self._joint + 1))
         if verdict != ReadingVerdict.GOOD:
             self.unusable += 1
             return False

@@ -215,11 +215,6 @@ class ArmWatch:
             self.now.copy(), self._limits, self._times.copy(), self._bounds.copy(), (0.0, 0.0, 0.0)
         )
 
-    @property
-    def room(self) -> Array:
-        """(n,) N m beyond the expected torque that a command may have now."""
-        return self._bounds[0]
-
     def step(self, most: Array, dt_s: float) -> Array:
         """The command (n,) N m of a tick.
 

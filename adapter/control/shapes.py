@@ -33,37 +33,21 @@ ENOUGH_M = 0.02  # beyond the known shapes, a frame on the hand says that someth
 
 
 @dataclass(frozen=True)
-class Capsule:
-    """All within `radius` of a line between two points.
+class Body:
+    """All within `radius` of a line between two points (a capsule), or of a mesh's convex hull.
+
+    The hull fills hollows: on the safe side.
 
     Attributes:
         link: number of the link that it is on, -1 for the base.
-        ends: (2, 3) in that link's frame, m.
+        ends: (2, 3) of the line, or (k, 3) corners of the hull, in that link's frame, m.
+        triangles: (m, 3) numbers of three corners each; None of a capsule.
     """
 
     link: int
     ends: Array
-    radius: float
-
-
-@dataclass(frozen=True)
-class Hull:
-    """The convex hull of a mesh, which fills hollows: on the safe side.
-
-    Attributes:
-        link: as a capsule's.
-        ends: (k, 3) its corners in the link's frame, m.
-        triangles: (m, 3) numbers of three corners each.
-        radius: around it.
-    """
-
-    link: int
-    ends: Array
-    triangles: NDArray[np.int64]
     radius: float = 0.0
-
-
-Body = Capsule | Hull
+    triangles: NDArray[np.int64] | None = None
 
 
 def bodies_of(model: SelfModel, hand: Hand | None = None) -> list[Body]:
@@ -75,7 +59,7 @@ def bodies_of(model: SelfModel, hand: Hand | None = None) -> list[Body]:
     found: list[Body]
     if known is not None:
         found = [
-            Capsule(number - 1, row[:6].reshape(2, 3), float(row[6]))
+            Body(number - 1, row[:6].reshape(2, 3), float(row[6]))
             for number, rows in known.capsules.items()
             for row in rows
         ]
@@ -86,7 +70,7 @@ def bodies_of(model: SelfModel, hand: Hand | None = None) -> list[Body]:
         found += [capsule for link in sorted(bare) for capsule in _of_inertia(model, link)]
     if hand is not None:
         ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, hand.length]])
-        found += [Capsule(link, ends, hand.radius) for link in leaves(model)]
+        found += [Body(link, ends, hand.radius) for link in leaves(model)]
     return found
 
 
@@ -95,14 +79,14 @@ def leaves(model: SelfModel) -> list[int]:
     return [link for link in range(model.tree.n) if link not in model.tree.parent]
 
 
-def _on_the_hand(model: SelfModel, known: list[Body]) -> Iterator[Capsule]:
+def _on_the_hand(model: SelfModel, known: list[Body]) -> Iterator[Body]:
     """Room for what a file hangs on the flange of an arm whose own shapes are known."""
     for link in leaves(model):
         reach = max(np.abs(c.ends).max() + c.radius for c in known if c.link == link)
         for frame in model.frames:
             far = np.linalg.norm(frame.position) > reach + ENOUGH_M
             if frame.parent == model.tree.link_names[link] and far:
-                yield Capsule(link, np.array([np.zeros(3), frame.position]), HAND_RADIUS_M)
+                yield Body(link, np.array([np.zeros(3), frame.position]), HAND_RADIUS_M)
 
 
 def _of_collisions(model: SelfModel) -> tuple[list[Body], set[int]]:
@@ -129,13 +113,13 @@ def _of_collisions(model: SelfModel) -> tuple[list[Body], set[int]]:
             line = None if shape is None else _line_of(shape)
             if line is not None:
                 ends = np.array([p - R @ line[0], p + R @ line[0]])
-                found.append(Capsule(body, ends, line[1]))
+                found.append(Body(body, ends, line[1]))
             elif shape is not None and shape.tag == "mesh":
                 mesh = _mesh_of(shape, source, link.get("name", ""))
                 if mesh is None:
                     lacking.add(body)
                 else:
-                    found.append(Hull(body, p + mesh.corners @ R.T, mesh.triangles))
+                    found.append(Body(body, p + mesh.corners @ R.T, triangles=mesh.triangles))
     return found, lacking
 
 
@@ -178,7 +162,7 @@ def _line_of(shape: ET.Element) -> tuple[Array, float] | None:
     return None
 
 
-def _of_inertia(model: SelfModel, link: int) -> Iterator[Capsule]:
+def _of_inertia(model: SelfModel, link: int) -> Iterator[Body]:
     """Capsules from a link's joint to the joints that it carries, or through its centre of mass.
 
     The radius is that of a solid cylinder with the link's inertia about the line.
@@ -197,4 +181,4 @@ def _of_inertia(model: SelfModel, link: int) -> Iterator[Capsule]:
         if inertia is not None and length > 0.0:
             about = float(end @ inertia @ end) / length**2
             radius = float(np.clip(np.sqrt(2.0 * about / mass), THINNEST_M, THICKEST_M))
-        yield Capsule(link, np.array([np.zeros(3), end]), radius)
+        yield Body(link, np.array([np.zeros(3), end]), radius)

@@ -15,8 +15,7 @@ from adapter.discovery.frames import in_joint_frame
 from adapter.discovery.hypotheses import Option
 from adapter.discovery.verdict import UNSEEN_BASE, Discovery
 from adapter.errors import ModelError
-from adapter.learning.batch.moments import LinkNoise
-from adapter.learning.batch.schema import BatchSchemaSettings, SchemaResult, schema_from_moments
+from adapter.learning.batch.schema import SchemaResult, schema_from_moments
 from adapter.learning.batch.theta_factors import row_factors, scales, system
 from adapter.learning.batch.theta_filling import filled_words
 from adapter.learning.batch.theta_solvers import consistent_theta, least_squares_theta
@@ -59,7 +58,7 @@ def learn(discovery: Discovery) -> LearnedTree:
         moving = variance[variance > 0.0]
         size = np.median(moving) if len(moving) else 0.0
         noise[k] = float(np.sqrt(size * excess.get(k, 1.0))) + CHANNEL_NOISE_FLOOR
-    schema = schema_from_moments(data, BatchSchemaSettings(noise=LinkNoise(**noise)))
+    schema = schema_from_moments(data, np.array(list(noise.values())))
     # neighbouring samples share their noise: the filter leaves fewer independent ones
     gain = np.sqrt(max(1.0, log.samples / log.noise_samples))
     return LearnedTree(data, replace(schema, std=schema.std * gain))

@@ -25,7 +25,7 @@ from adapter.learning.batch.prediction_errors import (
     predicted_torques,
 )
 from adapter.learning.batch.schema import schema_from_moments
-from adapter.learning.batch.theta import BatchThetaSettings, ThetaResult, learn_theta
+from adapter.learning.batch.theta import ThetaResult, learn_theta
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings, SchemaSettings
 from adapter.learning.tree_data import BodyMotion, TreeData
@@ -86,7 +86,7 @@ def learn_bodies(data: TreeData, seed: int) -> tuple[NetworkResult, Body, Body]:
         ("FOPnet", networks.lam, networks_s),
         ("FOPnet, moments", lam, moments_s),
     ):
-        theta = learn_theta(data, own, seed)
+        theta = learn_theta(data, own)
         bodies.append(Body(name, own, theta, schema_s, lap()))
     return networks, bodies[0], bodies[1]
 
@@ -152,7 +152,7 @@ def _worst(parts: list[KinematicErrors]) -> KinematicErrors:
     )
 
 
-def noisy_trial(source: Falls, parts: Split, true_lam: Array, seed: int) -> dict[str, Any]:
+def noisy_trial(source: Falls, parts: Split, true_lam: Array) -> dict[str, Any]:
     """Learned λ and θ against weighted least squares with true λ, all from noisy sensors.
 
     Both see the same filtered samples (1 % of the training set) and are judged on the control
@@ -161,8 +161,8 @@ def noisy_trial(source: Falls, parts: Split, true_lam: Array, seed: int) -> dict
     data = gathered(source, parts, parts.learned, noisy=True)
     n = data.tree.n
     lam = schema_from_moments(data).lam
-    theta = learn_theta(data, lam, seed)
-    best = learn_theta(data, true_lam, seed, BatchThetaSettings(solver="least squares"))
+    theta = learn_theta(data, lam)
+    best = learn_theta(data, true_lam, possible=False)
     square, count = np.zeros((2, n)), 0
     for k in parts.control:
         control = source.measured(k)
@@ -205,7 +205,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     by_networks, by_moments = judge(bodies, data, source, parts)
     say("learning from noisy sensors")
     noisy_parts = split(count * [len(source.measured(0))], args.seed)
-    noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
+    noise = noisy_trial(source, noisy_parts, truth.lam)
     learners = [by_networks.learned, by_moments.learned]
     if not args.no_baselines:
         learners += _baselines(args, source, parts, say)

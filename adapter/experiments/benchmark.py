@@ -23,8 +23,9 @@ from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.export import to_urdf
 from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Filtered, OnlineLearner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
+from adapter.learning.theta import Filtered
 from adapter.model.inertia import log_cholesky_from_theta
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from adapter.experiments.split import Split
-from adapter.learning.batch.smoothing import Measured, smoothed_data
+from adapter.learning.batch.smoothing import smoothed_data
 from adapter.learning.tree_data import BodyMotion, TreeData, stacked
 from adapter.model.tree import Tree
 from sim.falls.data_set import FallData
@@ -41,7 +41,7 @@ class Falls:
 
     def measured(self, k: int) -> TreeData:
         """Trajectory k as its sensors show it, filtered alike."""
-        return smoothed_data(self.tree, Measured(**self.noisy[k]))
+        return smoothed_data(self.tree, self.noisy[k])
 
 
 def gathered(source: Falls, parts: Split, rows: np.ndarray, noisy: bool) -> TreeData:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from adapter.errors import SettingsError
-from adapter.learning.learner import Change, OnlineLearner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.schema_kernels import MotionMoments
 from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
@@ -86,7 +86,7 @@ def save_checkpoint(learner: OnlineLearner, path: str | Path, *, sync: bool = Tr
     size = len(learner._held)
     rows = np.arange(learner._held_from, learner._held_to) % size
     arrays[".held"] = learner._held[rows]
-    arrays[".changes"] = np.array([change.stamp_ns for change in learner.changes], dtype=np.int64)
+    arrays[".changes"] = np.array(learner.changes, dtype=np.int64)
     arrays["adam.steps"] = learner.adam.steps
     with whole_file(Path(path)) as place, place.open("wb") as file:
         np.savez(file, **arrays)
@@ -128,7 +128,7 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     learner.schema.take_state(more)
     size = len(learner._held)
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
-    learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]
+    learner.changes[:] = arrays[".changes"].tolist()
     learner.adam.steps = int(arrays["adam.steps"])
 
 

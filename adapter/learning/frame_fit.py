@@ -187,12 +187,18 @@ def best_frame(sums: Array, weights: Array, prior: Frame) -> tuple[Frame, float]
     return min((x for x in found if x[1] <= good), key=lambda x: x[0].distance(prior))
 
 
-def hidden_freedom(sums: Array, weights: Array, frame: Frame, least: float) -> Freedom:
-    """What moments do not show of a frame: all whose curvature is not above `least`."""
+def curvature_in_parent(sums: Array, weights: Array, frame: Frame) -> tuple[Array, Array]:
+    """Eigenvalues (6,) and eigenvectors (6, 6), in columns, by [turn; shift] in parent's axes."""
     _, _, own = slope_and_curvature(sums, weights, frame)
     turn = np.eye(6)
     turn[:3, :3] = frame.R0
     values, vectors = np.linalg.eigh(turn @ own @ turn.T)
+    return values, vectors
+
+
+def hidden_freedom(sums: Array, weights: Array, frame: Frame, least: float) -> Freedom:
+    """What moments do not show of a frame: all whose curvature is not above `least`."""
+    values, vectors = curvature_in_parent(sums, weights, frame)
     hidden = vectors[:, values <= least]
     return Freedom.of((hidden @ hidden.T)[None], frame.p[None])
 

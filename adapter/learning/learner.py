@@ -7,31 +7,27 @@ whose base's motion comes with each state.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from adapter.effects.active import Active
-from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.judgement.noise import memory_s
 from adapter.learning.adam import FlatAdam, same_bits
 from adapter.learning.change import ChangeDetector, explained_share, is_new
 from adapter.learning.imu_schema import ImuSchema
-from adapter.learning.known_effects import KnownEffects, believed, starts_from, told_shapes
+from adapter.learning.known_effects import KnownEffects, starts_from
 from adapter.learning.posterior import LearnedPosterior, learned_posterior
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import LearnerSettings, Mode
 from adapter.learning.steps import Done, steps
-from adapter.learning.theta import Theta, ThetaKnowledge
+from adapter.learning.theta import Filtered, KnownArm, Theta
 from adapter.learning.theta_kernels import Moments
 from adapter.learning.torque_rates import TorqueRates
 from adapter.learning.trace import Trace
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import Frames, JointMotion, base_at_rest, jit, regressors
-from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import StateLayout, stamp_of, stamps_of
 
 JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
@@ -47,54 +43,6 @@ MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s²
 LOAD_SHARE = 0.95
 NEW_SHARE = 0.5  # of an error's power at velocities that are new: it is of those
 MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
-
-
-@dataclass(frozen=True)
-class Filtered:
-    """What the filter before the learner does to signals.
-
-    Attributes:
-        noise_gain: correlated samples that one independent sample is worth
-            (`JointFilter.noise_gain`).
-        delay_s: of the filter (`JointFilter.delay_s`).
-        state_s: between filtered states.
-    """
-
-    noise_gain: float = 1.0
-    delay_s: float = 0.0
-    state_s: float = 1e-3
-
-
-@dataclass(frozen=True)
-class KnownArm:
-    """What is known of the robot beside its topology.
-
-    Attributes:
-        hand: the link whose load may change; None for the last one.
-        tool_theta: (10,) of a known tool on the hand, kept out of θ.
-        effects: lasting ones that a model brings, none of bodies (`with_bodies`). Those that are
-            learned start from the model's values; the others are taken off the states.
-        arm: the model's rigid arm, needed where there are such effects. Its gravity is what
-            torques and measured link motion show; where the base is tilted it is not that of
-            the documentation, which synthesized link motion is made with.
-        lam: (n, 6) documented λ, which sensors mounted anyhow start from; nobody else looks at it.
-        theta: (n, 10) documented θ of the links, which the posterior is about; ADAM knows nothing
-            of it.
-    """
-
-    hand: int | None = None
-    tool_theta: Array | None = None
-    effects: Sequence[Active] = ()
-    arm: RigidArm | None = None
-    lam: Array | None = None
-    theta: Array | None = None
-
-
-@dataclass(frozen=True)
-class Change:
-    """A change at the hand: when it was seen (stamp of the filtered state, ns)."""
-
-    stamp_ns: int
 
 
 class Watch(Protocol):
@@ -149,7 +97,7 @@ class OnlineLearner:
             that no robot shows.
         theta_started_ns: stamp at which θ began; None before.
         rebuilds: times that θ's moments were rebuilt for a better λ.
-        changes: at the hand, in order.
+        changes: stamps, ns, of the filtered states at which a change at the hand was seen.
         screen: judges the states that `step` is given, see `adapter.runs.live`; verdict:
             what it said last.
 
@@ -183,18 +131,7 @@ class OnlineLearner:
             raise SettingsError("sensors on links need a documented λ to start from")
         else:
             self.schema = ImuSchema(tree, rest, s.schema, known.lam)
-        told = believed(known.effects, s.effects, tree.n)
-        before = ThetaKnowledge(
-            None if rest is None else rest.measured,
-            filtered.noise_gain,
-            filtered.delay_s,
-            known.hand,
-            known.tool_theta,
-            told,
-            told_shapes(known.effects, s.effects, tree.n),
-            s.base_wrench,
-        )
-        self.theta = Theta(tree, before, effects_by_name(s.effects), s.theta, each_sample)
+        self.theta = Theta(tree, self.base, s, filtered, known)
         by_rates = any(effect.by_rates for effect in self.theta.effects)
         self._rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
         self.rates = self._rates if by_rates else None
@@ -229,7 +166,7 @@ class OnlineLearner:
         self.stamp_ns = 0
         self.theta_started_ns: int | None = None
         self.theta_converged = False
-        self.changes: list[Change] = []
+        self.changes: list[int] = []
         self.watch: Watch | None = None
         self.screen: Callable[[Array], TorqueVerdict] | None = None
         self.verdict = NOT_ASKED
@@ -388,12 +325,12 @@ class OnlineLearner:
         """What `steps` needs, with so many states ahead for θ."""
         adam = self.adam
         moved = adam.parameters, adam.gradient, adam.first, adam.second, adam.steps
-        span_ns, waiting, buffer = self._rates.parts
+        span_ns, *rates = self._rates.parts
         span_ns = 0 if self.rates is None else span_ns
         return (
             self.schema.parts(),
             self.theta.parts(self.frames, self.theta_converged),
-            (span_ns, waiting, np.empty_like(self.theta.theta), buffer, self._which),
+            (span_ns, *rates, np.empty_like(self.theta.theta), self._which),
             self.change.parts(ahead),
             (*moved, (adam.rate, *adam.betas)),
         )
@@ -615,7 +552,7 @@ class OnlineLearner:
         return np.asarray(self._held[rows, self.layout.dq.start : self.layout.ddq.stop])
 
     def _start_change(self, stamp_ns: int) -> None:
-        self.changes.append(Change(stamp_ns))
+        self.changes.append(stamp_ns)
         self.theta.start_change()
         self._held_from = self._held_to
         self._shadow = None

@@ -16,9 +16,6 @@ class Mode(StrEnum):
     SAMPLE = "sample"
 
 
-MODES = tuple(Mode)
-
-
 @dataclass(frozen=True)
 class SchemaSettings:
     """How λ is learned.
@@ -170,8 +167,8 @@ class LearnerSettings:
     change: ChangeSettings = field(default_factory=ChangeSettings)
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise SettingsError(f"no learner mode '{self.mode}'; have: {', '.join(MODES)}")
+        if self.mode not in tuple(Mode):
+            raise SettingsError(f"no learner mode '{self.mode}'; have: {', '.join(Mode)}")
         if self.held_samples < 1000:
             raise SettingsError(f"held_samples must be at least 1000, got {self.held_samples}")
         if self.update_every < 1:

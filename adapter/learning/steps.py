@@ -73,49 +73,6 @@ class ThetaParts(NamedTuple):
     updates: int
 
 
-class RateParts(NamedTuple):
-    """What `TorqueRates` has.
-
-    Attributes:
-        span_ns: 0 where no effect asks for rates, and the rest is not looked at.
-        waiting: `Waiting` as a plain tuple; bodies (b, 10) and buffer (k, w) are overwritten.
-        which: (c, 2) columns of effects that are rates, and where these begin in a state.
-    """
-
-    span_ns: int
-    waiting: tuple
-    bodies: Array
-    buffer: Array
-    which: NDArray[np.int64]
-
-
-class ChangeParts(NamedTuple):
-    """What `ChangeDetector` has.
-
-    Attributes:
-        speeds: `fast` and `slow`; samples: so far.
-        recent, level: (n,) of `compare`.
-        most: ratios of `compare` below which nothing is an alarm; infinite while nothing is.
-    """
-
-    speeds: tuple[int, int]
-    samples: int
-    recent: Array
-    level: Array
-    most: tuple[float, float]
-
-
-class AdamParts(NamedTuple):
-    """What `FlatAdam` has: four of (P,), steps so far, and (rate, beta1, beta2)."""
-
-    parameters: Array
-    gradient: Array
-    first: Array
-    second: Array
-    steps: int
-    pace: tuple[float, float, float]
-
-
 class Done(NamedTuple):
     """What `steps` leaves, by step (m) or by state that θ was given (k).
 
@@ -144,17 +101,22 @@ def steps(table, parts, done):
     state already, and has its gradient.
 
     Args:
-        parts: λ's, θ's, those of rates, of changes and of ADAM, as plain tuples.
+        parts: as plain tuples, `SchemaParts`; `ThetaParts`; of rates `TorqueRates.parts`, the span
+            0 where no effect asks for them, room (b, 10) for θ in use, and (c, 2) columns of
+            effects that are rates, and where these begin in a state; `ChangeDetector.parts`;
+            `FlatAdam.parts`.
         done: `Done` as a plain tuple, whose rows but for rates, columns and ends are filled.
     """
     parts, done = borrowed((parts, done))
-    schema, theta, rates = SchemaParts(*parts[0]), ThetaParts(*parts[1]), RateParts(*parts[2])
-    change, adam, out = ChangeParts(*parts[3]), AdamParts(*parts[4]), Done(*done)
+    schema, theta, out = SchemaParts(*parts[0]), ThetaParts(*parts[1]), Done(*done)
+    span_ns, waiting, buffer, bodies, which = parts[2]
+    speeds, samples, recent, level, most = parts[3]
+    parameters, slope, first, second, taken, adam_pace = parts[4]
     parent, R0, p = schema.frames
     known = MotionMoments(*schema.moments)
     sizes, n, begin = Rows(*theta.rows).steps, parent.shape[0], 0
     data = theta.sums[0][0], theta.sums[0][1]
-    pace = schema.pace[0], schema.pace[1], adam.pace[0]
+    pace = schema.pace[0], schema.pace[1], adam_pace[0]
     before_links = table[:, : out.rows.shape[1]].copy()
     for m in range(table.shape[0]):
         one, end = table[m : m + 1], out.ends[m]
@@ -162,32 +124,30 @@ def steps(table, parts, done):
             each = 1.0, schema.weight
             absorb(parent, schema.base, one, schema.moments, schema.kind, each)
             found = schema.gradient, schema.distance
-            samples = known.counts[Count.SAMPLES]
-            descend(schema.frames, known.M, samples, schema.inverse, *found)
+            count = known.counts[Count.SAMPLES]
+            descend(schema.frames, known.M, count, schema.inverse, *found)
         out.th[m] = theta.th
-        if rates.span_ns:
+        if span_ns:
             for b in range(theta.in_use.shape[0]):
-                rates.bodies[b] = theta.th[10 * theta.in_use[b] : 10 * theta.in_use[b] + 10]
-            arm = *theta.frames, rates.bodies, schema.base
+                bodies[b] = theta.th[10 * theta.in_use[b] : 10 * theta.in_use[b] + 10]
+            arm = *theta.frames, bodies, schema.base
             state = before_links[m : m + 1]
-            follow_rates(arm, state, rates.span_ns, rates.waiting, rates.buffer)
+            follow_rates(arm, state, span_ns, waiting, buffer)
             for k in range(begin, end):
-                out.rows[k] = rates.buffer[k - begin]
-                for c in range(rates.which.shape[0]):
-                    at = rates.which[c, 1]
-                    out.columns[k, rates.which[c, 0]] = out.rows[k, at : at + n]
+                out.rows[k] = buffer[k - begin]
+                for c in range(which.shape[0]):
+                    at = which[c, 1]
+                    out.columns[k, which[c, 0]] = out.rows[k, at : at + n]
         suspect = False
         if end > begin:
             own, columns = out.rows[begin:end], out.columns[begin:end]
             error = absorb_torque(theta.frames, theta.rows, theta.given, own, columns, theta.sums)
             out.errors[begin:end] = error
-            levels = change.recent, change.level
-            ratios = compare(error, 1, change.speeds, change.samples + end, *levels)
+            ratios = compare(error, 1, speeds, samples + end, recent, level)
             out.ratios[m, 0], out.ratios[m, 1] = ratios
-            suspect = ratios[0] > change.most[0] or ratios[1] > change.most[1]
+            suspect = ratios[0] > most[0] or ratios[1] > most[1]
         gradient(theta.x, theta.rows, data, theta.prior, theta.weighing, theta.work)
-        moved = adam.parameters, adam.gradient, adam.first, adam.second
-        adam_step(*moved, adam.steps + m + 1, adam.pace)
+        adam_step(parameters, slope, first, second, taken + m + 1, adam_pace)
         retract(schema.frames, schema.tangent, schema.may_move, schema.distance, pace)
         span = min(float(theta.updates + m + 1), theta.span)
         follow_mean(theta.x, span, sizes, theta.mean, theta.th)

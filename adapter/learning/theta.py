@@ -21,11 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.active import Active
 from adapter.effects.base import LearnedEffect
 from adapter.effects.by_joint import AT_REST, JointSignals, slowness
-from adapter.errors import SettingsError
+from adapter.effects.catalogue import effects_by_name
 from adapter.judgement.noise import MEMORY_S
-from adapter.learning.settings import ThetaSettings
+from adapter.learning.known_effects import believed, told_shapes
+from adapter.learning.settings import LearnerSettings, Mode
 from adapter.learning.theta_kernels import (
     Given,
     Moments,
@@ -44,6 +46,7 @@ from adapter.model.inertia import log_cholesky_from_theta, min_eigenvalue, theta
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
 from adapter.physics.kernels import jit
+from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import StateLayout
 
 # Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
@@ -83,29 +86,44 @@ def neutral_body() -> Array:
 
 
 @dataclass(frozen=True)
-class ThetaKnowledge:
-    """What is known before any torque.
+class Filtered:
+    """What the filter before the learner does to signals.
 
     Attributes:
-        base: (12,) motion of a base at rest; None where it floats and the states tell.
-        noise_gain: correlated samples that one independent sample is worth.
-        delay_s: of the filter that torque and motion went through.
-        hand: the link whose load may change, and that carries a tool; None for the last one.
-        tool_theta: (10,) of a known tool, kept out of θ.
-        believed: (e, n) values of the effects' parameters and their standard deviations, from a
-            model; NaN where it says nothing, which is held for absent until data show it.
-        shapes: (e, n) of the effects as the model has them, NaN where it says nothing.
-        wrench: whether the wrench on a floating base is known.
+        noise_gain: correlated samples that one independent sample is worth
+            (`JointFilter.noise_gain`).
+        delay_s: of the filter (`JointFilter.delay_s`).
+        state_s: between filtered states.
     """
 
-    base: Array | None = None
     noise_gain: float = 1.0
     delay_s: float = 0.0
+    state_s: float = 1e-3
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """What is known of the robot beside its topology.
+
+    Attributes:
+        hand: the link whose load may change; None for the last one.
+        tool_theta: (10,) of a known tool on the hand, kept out of θ.
+        effects: lasting ones that a model brings, none of bodies (`with_bodies`). Those that are
+            learned start from the model's values; the others are taken off the states.
+        arm: the model's rigid arm, needed where there are such effects. Its gravity is what
+            torques and measured link motion show; where the base is tilted it is not that of
+            the documentation, which synthesized link motion is made with.
+        lam: (n, 6) documented λ, which sensors mounted anyhow start from; nobody else looks at it.
+        theta: (n, 10) documented θ of the links, which the posterior is about; ADAM knows nothing
+            of it.
+    """
+
     hand: int | None = None
     tool_theta: Array | None = None
-    believed: tuple[Array, Array] | None = None
-    shapes: Array | None = None
-    wrench: bool = True
+    effects: Sequence[Active] = ()
+    arm: RigidArm | None = None
+    lam: Array | None = None
+    theta: Array | None = None
 
 
 class Theta:
@@ -113,10 +131,9 @@ class Theta:
 
     Args:
         tree: N and A.
-        known: see `ThetaKnowledge`.
-        effects: learned beside θ.
-        settings: how.
-        each_sample: learn from the newest sample alone, as the paper does.
+        base: (12,) motion of a base at rest; empty where it floats and the states tell.
+        settings: of the learner; filtered: what the filter did to the states.
+        known: what is known of the robot.
 
     Attributes:
         x: (P,) what ADAM steps on: log-Cholesky of the bodies (the base first if it floats, the
@@ -131,7 +148,9 @@ class Theta:
         own: by effect, which of all effects' columns are its own.
         shapes: (e, n) of the effects that have several columns, chosen between their shapes by what
             the data say; NaN for the others.
-        believed: (e, n) of effects before any torque, see `ThetaKnowledge`; NaN without belief.
+        believed: (e, n) values of the effects' parameters and their standard deviations before any
+            torque, from a model; NaN where it says nothing, which is held for absent until data
+            show it.
         effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
             body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
@@ -141,16 +160,16 @@ class Theta:
     def __init__(
         self,
         tree: Tree,
-        known: ThetaKnowledge,
-        effects: Sequence[LearnedEffect] = (),
-        settings: ThetaSettings | None = None,
-        each_sample: bool = False,
+        base: Array,
+        settings: LearnerSettings,
+        filtered: Filtered,
+        known: KnownArm,
     ) -> None:
-        self.tree, self.effects, self.each_sample = tree, tuple(effects), each_sample
-        self.settings = settings or ThetaSettings()
+        self.tree, self.effects = tree, tuple(effects_by_name(settings.effects))
+        self.settings, self.each_sample = settings.theta, settings.mode == Mode.SAMPLE
         self.layout = StateLayout(tree.n, tree.floating)
-        self.noise_gain, self._wrench = known.noise_gain, float(known.wrench)
-        self.smoothing_s = STEP_SMOOTHING * known.delay_s
+        self.noise_gain, self._wrench = filtered.noise_gain, float(settings.base_wrench)
+        self.smoothing_s = STEP_SMOOTHING * filtered.delay_s
         n, e = tree.n, len(self.effects)
         self.bodies = tree.bodies + 1
         self.P = 10 * self.bodies + n * e
@@ -165,7 +184,7 @@ class Theta:
         self.own = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
         self.rows = rows_of(tree, self.effects)
         self.shapes = np.full((e, n), np.nan)
-        self._choose_shapes(known.shapes)
+        self._choose_shapes(told_shapes(known.effects, settings.effects, n))
         self._rows = tuple(self.rows)  # numba takes 3 µs longer for a named tuple
         self._places = self.rows.place.copy(), self.rows.base_place.copy()
         self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
@@ -174,16 +193,14 @@ class Theta:
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
         nothing: Array = np.full((e, n), np.nan)
-        self.believed = known.believed or (nothing, nothing)
+        told = believed(known.effects, settings.effects, n)
+        self.believed = told or (nothing, nothing)
         self._set_prior(*self._neutral_prior())
         self.x, self.gradient = np.zeros((2, self.P))
         self.x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
         self.x[self._effects_from :] = np.nan_to_num(self.believed[0]).ravel() / self.rows.steps
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
         values(self.mean, self.rows.steps, self.th)
-        if known.base is None and not tree.floating:
-            raise SettingsError("a tree whose base does not float needs its base's motion")
-        base = np.empty(0) if known.base is None or tree.floating else known.base
         tool = np.zeros(10) if known.tool_theta is None else np.array(known.tool_theta)
         self._given = tuple(Given(base, tool, np.array([hand]), self.th))
         self._work = np.zeros(self.P), np.zeros(self.P)

@@ -98,18 +98,24 @@ def bend(tau, one, two, step_s, bends):
 
 
 @jit
+def model_torque(frames, theta, row, at, rest, tau):
+    """Fill tau (rows,) with what the bodies make of a state; `rest` as of `follow`'s arm."""
+    base = rest if rest.shape[0] else row[at.base : at.bent]
+    q, dq, ddq = row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau]
+    motion = np.empty((frames.parent.shape[0], 12))
+    link_motion(frames, JointMotion(q, dq, ddq), base, motion)
+    inverse_dynamics(frames, theta, q, motion, base, tau)
+
+
+@jit
 def bend_all(arm, triples, bends):
     """Add those of states (t, 3, w) that follow each other; `arm` as of `follow`."""
     parent, R0, p, theta, rest = arm
     frames, n, six = Frames(parent, R0, p), parent.shape[0], 0 if rest.shape[0] else 6
-    at, motion, tau = columns(n, six > 0), np.empty((n, 12)), np.empty((3, n + six))
+    at, tau = columns(n, six > 0), np.empty((3, n + six))
     for m in range(triples.shape[0]):
         for k in range(3):
-            row = triples[m, k]
-            base = row[at.base : at.bent] if six else rest
-            q, dq, ddq = row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau]
-            link_motion(frames, JointMotion(q, dq, ddq), base, motion)
-            inverse_dynamics(frames, theta, q, motion, base, tau[k])
+            model_torque(frames, theta, triples[m, k], at, rest, tau[k])
         first, last = triples[m, 0, :1].view(np.int64)[0], triples[m, 2, :1].view(np.int64)[0]
         if 0 < last - first <= LONGEST_STEP_NS:
             bend(tau[2, six:], tau[1, six:], tau[0, six:], 0.5e-9 * (last - first), bends)
@@ -128,7 +134,7 @@ def follow(arm, table, span_ns, waiting, out):
     frames, ring = Frames(parent, R0, p), Waiting(*waiting)
     n, six, count = parent.shape[0], 0 if rest.shape[0] else 6, 0
     at = columns(n, six > 0)
-    motion, tau = np.empty((n, 12)), np.empty(n + six)
+    tau = np.empty(n + six)
     for m in range(table.shape[0]):
         row = table[m]
         stamp = row[:1].view(np.int64)[0]
@@ -139,10 +145,7 @@ def follow(arm, table, span_ns, waiting, out):
                 count += 1
             ring.marks[:] = 0
         here = ring.marks[1] % ROOM
-        base = row[at.base : at.bent] if six else rest
-        q, dq, ddq = row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau]
-        link_motion(frames, JointMotion(q, dq, ddq), base, motion)
-        inverse_dynamics(frames, theta, q, motion, base, tau)
+        model_torque(frames, theta, row, at, rest, tau)
         ring.rows[here], ring.tau[here], ring.stamps[here] = row, tau[six:], stamp
         ring.marks[1] += 1
         if ring.marks[1] > 2:

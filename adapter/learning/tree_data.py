@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
-from adapter.physics.networks import FrameMotion
+from adapter.physics.kernels import JointMotion
 from adapter.signals.records import KIND, STAMP, LinkMotionKind, StateLayout
 
 
@@ -41,13 +40,6 @@ class BodyMotion:
         """Motion rows [v w a dw] (..., 12); zero for a velocity that nothing measures."""
         v = np.zeros_like(self.w) if self.v is None else self.v
         return np.concatenate([v, self.w, self.a, self.dw], axis=-1)
-
-    def torch(self) -> FrameMotion:
-        """As the networks take it; a velocity that nothing measures is zero there."""
-        v = np.zeros_like(self.w) if self.v is None else self.v
-        return FrameMotion(
-            *(torch.from_numpy(np.ascontiguousarray(x)) for x in (v, self.w, self.a, self.dw))
-        )
 
 
 @dataclass(frozen=True)
@@ -111,12 +103,9 @@ class TreeData:
             out[:, part] = signal
         return out
 
-    def joint_signals(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """q, dq, ddq as the networks take them."""
-        q, dq, ddq = (
-            torch.from_numpy(np.ascontiguousarray(x)) for x in (self.q, self.dq, self.ddq)
-        )
-        return q, dq, ddq
+    def joints(self) -> JointMotion:
+        """q, dq, ddq as the kernels take them."""
+        return JointMotion(*(np.ascontiguousarray(x) for x in (self.q, self.dq, self.ddq)))
 
 
 def stacked(parts: Sequence[TreeData]) -> TreeData:

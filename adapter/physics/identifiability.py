@@ -50,10 +50,6 @@ class BaseParameters:
     rank: int
     basis: Array
 
-    def of(self, theta: Array) -> Array:
-        """Coordinates (rank,) of parameters in the identifiable subspace."""
-        return self.basis.T @ np.asarray(theta, dtype=np.float64).ravel()
-
     def shown_map(self) -> Array:
         """(columns, columns): of a difference in θ what torques show.
 
@@ -63,10 +59,6 @@ class BaseParameters:
         size = np.tile(BODY_SIZE, len(self.basis) // len(BODY_SIZE))
         rows = np.linalg.qr(self.basis * size[:, None])[0]
         return np.asarray(size[:, None] * (rows @ rows.T) / size)
-
-    def distance(self, first: Array, second: Array) -> float:
-        """Length of the difference that torques can show."""
-        return float(np.linalg.norm(self.of(first) - self.of(second)))
 
 
 @dataclass(frozen=True)
@@ -108,7 +100,7 @@ def numerical_rank(matrix: Array, tolerance: float = RANK_TOLERANCE) -> tuple[in
     return rank, np.asarray(basis, dtype=np.float64)
 
 
-def random_motion(tree: Tree, samples: int, seed: int) -> JointMotion:
+def random_motion(tree: Tree, samples: int, seed: int = 0) -> JointMotion:
     """Independent random joint states that excite everything a joint can."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(-np.pi, np.pi, (samples, tree.n))
@@ -120,7 +112,7 @@ def random_regressor(
 ) -> tuple[JointMotion, Array]:
     """Random motion, and the regressor (samples, rows, 10 bodies) over it.
 
-    Arguments as of `base_parameters`.
+    Arguments as of `base_parameters`; wrench: whether that on a floating base is known.
     """
     motion = random_motion(tree, samples, seed)
     base = _random_base(tree, gravity, samples, seed)
@@ -133,9 +125,7 @@ def base_parameters(
     tree: Tree,
     lam: Array,
     gravity: Array,
-    seed: int = 0,
     extra: ExtraColumns | None = None,
-    wrench: bool = True,
 ) -> BaseParameters:
     """The identifiable subspace of θ, from the regressor over random motion.
 
@@ -143,19 +133,17 @@ def base_parameters(
         tree: N and A.
         lam: (n, 6) λ.
         gravity: (3,) in base axes, m/s². A floating base gets random motion of its own.
-        seed: of the motion.
         extra: columns of further effects to be counted beside θ (friction, offsets, ...).
-        wrench: whether the wrench on a floating base is known.
     """
     samples = max(20, 4 * 10 * tree.bodies // tree.rows + 10)
-    motion, matrix = random_regressor(tree, lam, gravity, samples, seed, wrench)
+    motion, matrix = random_regressor(tree, lam, gravity, samples)
     if extra is not None:
         matrix = np.concatenate([matrix, extra(*motion)], axis=2)
     rank, basis = numerical_rank(matrix.reshape(-1, matrix.shape[2]))
     return BaseParameters(rank, basis)
 
 
-def _random_base(tree: Tree, gravity: Array, samples: int, seed: int) -> Array:
+def _random_base(tree: Tree, gravity: Array, samples: int, seed: int = 0) -> Array:
     """Motion rows (samples, 12) of a floating base, or (1, 12) of one at rest."""
     if not tree.floating:
         return base_at_rest(gravity)[None]
@@ -163,26 +151,22 @@ def _random_base(tree: Tree, gravity: Array, samples: int, seed: int) -> Array:
     return np.concatenate([rng.normal(size=(samples, 3)) for _ in range(4)], axis=1)
 
 
-def frame_observability(
-    tree: Tree, lam: Array, gravity: Array, accelerations: bool = True, seed: int = 0
-) -> FrameObservability:
-    """Observable turns and shifts of every joint frame over random motion.
+def frame_observability(tree: Tree, lam: Array, gravity: Array) -> FrameObservability:
+    """Turns and shifts of every joint frame that link motion shows over random motion.
 
     Args:
         tree: N and A.
         lam: (n, 6) λ.
         gravity: (3,) in base axes, m/s². A floating base gets random motion of its own.
-        accelerations: whether link accelerations with gravity are seen beside the twists.
-        seed: of the motion.
     """
-    motion = random_motion(tree, 40, seed)
-    base = _random_base(tree, gravity, len(motion.q), seed)
+    motion = random_motion(tree, 40)
+    base = _random_base(tree, gravity, len(motion.q))
     links = np.empty((*motion.q.shape, 12))
     link_motions(frames_of(tree.parent, lam), motion, base, links)
     bases = []
     for j, i in enumerate(tree.parent):
         parent = np.broadcast_to(base, (len(links), 12)) if i == BASE else links[:, i]
-        matrix = frame_jacobian(parent, motion.dq[:, j], np.asarray(lam)[j], accelerations)
+        matrix = frame_jacobian(parent, motion.dq[:, j], np.asarray(lam)[j])
         _, values, rows = np.linalg.svd(matrix, full_matrices=False)
         shown = values > LEAST_SHOWN * values[0]
         bases.append(rows[shown].T if values[0] >= 1e-9 else np.zeros((6, 0)))
@@ -193,7 +177,7 @@ def frame_observability(
     return FrameObservability(sum(ranks), ranks, projectors, flags, freedom)
 
 
-def frame_jacobian(parent: Array, dq: Array, lam_j: Array, accelerations: bool) -> Array:
+def frame_jacobian(parent: Array, dq: Array, lam_j: Array) -> Array:
     """Change of link j's motion, in the parent's axes, with [turn; shift] of its frame, (.., 6).
 
     R becomes exp(φ) R: what reads Rᵀ x changes by Rᵀ [x ×] φ (eqs. 8a-8d); turning all rows into
@@ -202,19 +186,17 @@ def frame_jacobian(parent: Array, dq: Array, lam_j: Array, accelerations: bool) 
 
     Args:
         parent: (m, 12) motion rows of the parent; dq: (m,) of the joint; lam_j: (6,) its λ.
-        accelerations: whether accelerations are seen beside the twists.
     """
     v, w, a, dw = np.split(parent, 4, axis=1)
     p = lam_j[3:]
     axis = matrix_from_zxz(lam_j[:3])[:, 2]
     zero = np.zeros((len(w), 3, 3))
+    lever = skew(dw) + skew(w) @ skew(w)
+    spin = skew(dw) - dq[:, None, None] * (skew(axis) @ skew(w))
     rows = [
         np.concatenate([skew(v + np.cross(w, p)), skew(w)], axis=2),
         np.concatenate([skew(w), zero], axis=2),
+        np.concatenate([skew(a + lever @ p), lever], axis=2),
+        np.concatenate([spin, zero], axis=2),
     ]
-    if accelerations:
-        lever = skew(dw) + skew(w) @ skew(w)
-        spin = skew(dw) - dq[:, None, None] * (skew(axis) @ skew(w))
-        rows.append(np.concatenate([skew(a + lever @ p), lever], axis=2))
-        rows.append(np.concatenate([spin, zero], axis=2))
     return np.concatenate(rows, axis=1).reshape(-1, 6)

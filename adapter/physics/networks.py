@@ -48,6 +48,11 @@ class FrameMotion(NamedTuple):
     a: Tensor
     dw: Tensor
 
+    @classmethod
+    def of(cls, rows: Array) -> FrameMotion:
+        """From motion rows [v w a dw] (..., 12)."""
+        return cls(*torch.from_numpy(rows).split(3, dim=-1))
+
     def twist(self) -> Tensor:
         """[v; w], (..., 6)."""
         return torch.cat([self.v, self.w], dim=-1)

@@ -15,10 +15,10 @@ import shutil
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -40,15 +40,11 @@ from drivers.files.mcap import FLUSH_S, McapWriter
 from drivers.files.messages import Message
 
 UNFINISHED = "next"
+# How often news are published, and how often a recorder tells an estimate, the links' places and
+# what the loop's timing was meanwhile.
+NEWS_S, ESTIMATE_S, FRAMES_S, TIMING_S = 0.25, 0.1, 1.0 / 30.0, 1.0
 PUSHES = 100  # read from the loop's board before the posture at their instant is known
 HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
-
-
-class LearnerLike(Protocol):
-    """What is fed: every filtered state once, in order. It must copy what it keeps."""
-
-    def step(self, state: Array, /) -> object:
-        """Learn from one record of `StateLayout`."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,8 @@ class LearnerJob:
     """The learner process. The callables are top-level functions or partials of such.
 
     Attributes:
-        make: builds the learner there (and imports torch there).
+        make: builds the learner there: whatever has a `step` for a record of `StateLayout`, which
+            it must copy to keep.
         collect: what comes back at the end, picklable.
         publish: the estimate as it stands; None publishes nothing.
         news: what was found so far, for `SnapshotWriter.publish_news`; None says nothing.
@@ -64,11 +61,10 @@ class LearnerJob:
         keep: writes the whole state into an empty folder (learner, folder), for a successor if
             this process dies; restore: puts a fresh learner into it. Where None, nobody succeeds.
         effect_names: effects in the published estimate.
-        bodies: rows of θ in it; one per joint where None.
-        publish_s, news_s, save_s: how often.
+        publish_s, save_s: how often.
     """
 
-    make: Callable[[], LearnerLike]
+    make: Callable[[], Any]
     collect: Callable[[Any], Any]
     publish: Callable[[Any], Snapshot] | None = None
     news: Callable[[Any], Mapping[str, Any]] | None = None
@@ -76,9 +72,7 @@ class LearnerJob:
     keep: Callable[[Any, Path], None] | None = None
     restore: Callable[[Any, Path], None] | None = None
     effect_names: tuple[str, ...] = ()
-    bodies: int | None = None
     publish_s: float = 0.01
-    news_s: float = 0.25
     save_s: float = 5.0
 
 
@@ -91,17 +85,12 @@ class RecordingJob:
         metadata: configuration, version, ...: written at the start.
         attachments: files to put inside, by name.
         arm: told beside the samples, as documented and as learned; None tells no frames.
-        estimate_s, frames_s, timing_s: how often an estimate, the links' places and what the
-            loop's timing was meanwhile are told.
     """
 
     path: Path
     metadata: Mapping[str, Any] = field(default_factory=dict)
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     arm: ShownArm | None = None
-    estimate_s: float = 0.1
-    frames_s: float = 1.0 / 30.0
-    timing_s: float = 1.0
 
     def part(self, k: int) -> RecordingJob:
         """The same for the k-th successor of a recorder that died: a file of its own."""
@@ -124,6 +113,30 @@ class Jobs:
     recording: RecordingJob | None = None
     display: DisplayJob | None = None
     view: DisplayJob | None = None
+
+
+def drain(
+    ring: Ring, port: Port, take: Callable[[Array], object]
+) -> Iterator[tuple[int, float, bool]]:
+    """Hand records to `take` until the ring is finished and drained, or nobody is left.
+
+    What is taken is a copy: nobody sees memory that the loop writes to. Yields again and again how
+    many were taken, the time, and whether nothing comes any more.
+    """
+    own, drained = np.zeros(ring.size), False
+    while not drained:
+        finished = ring.finished
+        rows = ring.peek(ROWS_AT_ONCE)
+        for row in rows:
+            own[:] = row
+            take(own)
+        count = len(rows)
+        del rows
+        ring.take(count)
+        drained = not count and (finished or port.orphaned)
+        yield count, time.monotonic(), drained
+        if not count and not drained:
+            time.sleep(IDLE_S)
 
 
 @dataclass(frozen=True)
@@ -173,40 +186,25 @@ class LearnerTask:
     def _feed(self, learner: Any, ring: Ring, board: SnapshotWriter | None, port: Port) -> None:
         job = self.job
         keeping = self.keep_in is not None and job.keep is not None
-        own = np.zeros(ring.size)  # the learner never sees memory that the loop writes to
         fresh, publish_at, news_at = False, 0.0, 0.0
         save_at = keep_at = time.monotonic() + job.save_s
-        while True:
-            finished = ring.finished
-            rows = ring.peek(ROWS_AT_ONCE)
-            for row in rows:
-                own[:] = row
-                learner.step(own)
-            count = len(rows)
-            del rows
-            ring.take(count)
+        for count, now, drained in drain(ring, port, learner.step):
             if not keeping:
                 ring.give_back()
             fresh = fresh or count > 0
-            now = time.monotonic()
-            drained = not count and (finished or port.orphaned)
             due = fresh and (now >= publish_at or drained)
             if due and board is not None and job.publish is not None:
                 board.publish(job.publish(learner))
                 fresh, publish_at = False, now + job.publish_s
             if board is not None and job.news is not None and (now >= news_at or drained):
                 board.publish_news(job.news(learner))
-                news_at = now + job.news_s
+                news_at = now + NEWS_S
             if keeping and (now >= keep_at or 2 * ring.kept > ring.rows):
                 self._keep(learner, ring)
                 keep_at = now + job.save_s
             if job.save is not None and (now >= save_at or drained):
                 job.save(learner)
                 save_at = now + job.save_s
-            if drained:
-                return
-            if not count:
-                time.sleep(IDLE_S)
 
     def _keep(self, learner: Any, ring: Ring) -> None:
         """Keep a state, then give back what it has learned and remove those before it."""
@@ -269,35 +267,25 @@ class RecorderTask:
 
     def _drain(self, writer: McapWriter, ring: Ring, beside: Beside, port: Port) -> int:
         layout = RawLayout(len(self.joint_names), len(self.link_names))
-        own, written = layout.new(), 0
-        flush_at = time.monotonic()
-        while True:
-            finished = ring.finished
-            rows = ring.peek(ROWS_AT_ONCE)
-            for row in rows:
-                own[:] = row
-                sample, command, external = layout.sample(own)
-                writer.write(sample)
-                if command is not None:
-                    writer.write_command(sample.stamp_ns, command)
-                if external is not None:
-                    writer.write_external(sample.stamp_ns, external)
-                beside.sample(sample.stamp_ns, sample.q)
-            count = len(rows)
-            del rows
-            ring.take(count)
+        flush_at, written = time.monotonic(), 0
+
+        def write(record: Array) -> None:
+            sample, command, external = layout.sample(record)
+            writer.write(sample)
+            if command is not None:
+                writer.write_command(sample.stamp_ns, command)
+            if external is not None:
+                writer.write_external(sample.stamp_ns, external)
+            beside.sample(sample.stamp_ns, sample.q)
+
+        for count, now, drained in drain(ring, port, write):
             written += count
-            now = time.monotonic()
-            drained = not count and (finished or port.orphaned)
             beside.look(now, drained)
             if now >= flush_at or 2 * ring.kept > ring.rows:
                 writer.flush()
                 ring.give_back()
                 flush_at = now + HAND_OVER_S
-            if drained:
-                return written
-            if not count:
-                time.sleep(IDLE_S)
+        return written
 
 
 class Beside:
@@ -332,7 +320,7 @@ class Beside:
         self._stamp_ns = stamp_ns
         while self._pushes and self._pushes[0].stamp_ns <= stamp_ns:
             self._write(self._messages.push(self._pushes.popleft(), q))
-        if abs(stamp_ns - self._frames_at_ns) < 1e9 * self._job.frames_s:
+        if abs(stamp_ns - self._frames_at_ns) < 1e9 * FRAMES_S:
             return
         self._frames_at_ns = stamp_ns
         self._write(self._messages.frames(stamp_ns, q))
@@ -343,12 +331,12 @@ class Beside:
         """Tell what others know, where it is new; `last` when nothing comes any more."""
         if not self._stamp_ns or not (now >= self._look_at or last):
             return
-        self._look_at = now + self._job.estimate_s
+        self._look_at = now + ESTIMATE_S
         if self._reader is not None:
             self._write(self._messages.estimate(self._reader.read()))
             self._write(self._messages.news(self._stamp_ns, self._reader.read_news()))
         if self._board is not None and (now >= self._timing_at or last):
-            self._timing_at = now + self._job.timing_s
+            self._timing_at = now + TIMING_S
             self._write(self._messages.timing(self._stamp_ns, self._board.timing()))
 
     def _write(self, messages: Iterable[Message]) -> None:

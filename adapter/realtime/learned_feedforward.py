@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adapter.control.feedforward import ModelFeedforward
+from adapter.control.feedforward import Feedforward, ModelFeedforward
 from adapter.effects.active import Active
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -59,7 +59,7 @@ class FeedforwardBound:
         return bound
 
 
-class LearnedFeedforward(EstimateFollower):
+class LearnedFeedforward(EstimateFollower, Feedforward):
     """Inverse dynamics of the estimate that a learner publishes; ready once θ has converged.
 
     Attach it (`attach`) when the snapshot exists; before that it is not ready.
@@ -73,6 +73,7 @@ class LearnedFeedforward(EstimateFollower):
         bound: how far it may be from the documented model; anything goes where None.
 
     Attributes:
+        ready: an estimate of a converged θ was read.
         notes: that it fell back, where it did.
     """
 
@@ -90,18 +91,13 @@ class LearnedFeedforward(EstimateFollower):
         self._tool = np.zeros((tree.n, 10))
         if tool_theta is not None:
             self._tool[-1] = tool_theta
-        self._ready = False
+        self.ready = False
         self._bound, self._std = bound, np.zeros((tree.n, 10))
         self._asked = np.zeros((3, tree.n))
         self._most = np.full(tree.n, np.inf)
         self._jump, self._left = np.zeros((2, tree.n)), 0  # of the last change; calls to fade it
         self._believed, self._trust = True, 1.0
         self.notes: list[str] = []
-
-    @property
-    def ready(self) -> bool:
-        """An estimate of a converged θ was read."""
-        return self._ready
 
     def refresh(self) -> None:
         """Take over the newest estimate if it is valid; one that is not leaves the last."""
@@ -114,7 +110,7 @@ class LearnedFeedforward(EstimateFollower):
                 self._model.set(snapshot.lam, theta, effects, snapshot.effect_shapes)
                 self._fade_from(before)
                 self._std = snapshot.theta_std
-        if self._ready and self._bound is not None:
+        if self.ready and self._bound is not None:
             q, dq, ddq = self._asked
             self._most = self._bound.at(q, dq, ddq, self._std)
 
@@ -128,9 +124,9 @@ class LearnedFeedforward(EstimateFollower):
     def _fade_from(self, before: Array) -> None:
         """From what was said before to what the new parameters say."""
         self._left = 0
-        if self._ready and self._trust > 0.0:
+        if self.ready and self._trust > 0.0:
             self._jump, self._left = before - self._learned(), FADE_CALLS
-        self._ready = True
+        self.ready = True
         if self._bound is not None and self._trust == 0.0:
             q, dq, ddq = self._asked
             apart = np.abs(self._model(q, dq, ddq) - self._bound.model(q, dq, ddq))
@@ -143,7 +139,7 @@ class LearnedFeedforward(EstimateFollower):
         if self._left:
             self._left -= 1
             tau = tau + self._jump[0] * (self._left / FADE_CALLS)
-        if self._bound is None or not self._ready:
+        if self._bound is None or not self.ready:
             return tau
         documented = self._bound.model(q, dq, ddq)
         apart = tau - documented

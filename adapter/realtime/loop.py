@@ -16,14 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from adapter.control.controller import Controller
+from adapter.control.controller import ExcitationController
 from adapter.realtime.clock import Clock
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
-from adapter.realtime.real_time import DEFAULT_PRIORITY, Grant, RealTime, split_cores
-from adapter.realtime.session import Ended, FrontEndLike, Session, stop_arm
+from adapter.realtime.real_time import DEFAULT_PRIORITY, RealTime, split_cores
+from adapter.realtime.session import Ended, Session, stop_arm
 from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
+from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, Intake, JointSample
 
 LOOK_EVERY = 256  # ticks between two looks at the workers
@@ -75,10 +76,10 @@ class LiveResult:
         ended: why.
         fault: what the driver or the controller said; None where all was well.
         timing: report.
-        grants: what the operating system granted.
+        grants: what the operating system granted, a sentence each.
         collected: what the learner's `collect` gave; None without one, or where it died.
         troubles: workers that died or failed, one sentence each.
-        tracking: of the controller, see `Controller.tracking`; None in passive mode.
+        tracking: of the controller, see `ExcitationController.tracking`; None in passive mode.
         intake: the driver's account.
         contacts: what pushed the arm, filled in by whoever knows the arm.
     """
@@ -94,7 +95,7 @@ class LiveResult:
     ended: Ended
     fault: str | None
     timing: TimingReport
-    grants: list[Grant]
+    grants: list[str]
     collected: Any
     troubles: list[str]
     tracking: dict[str, Any] | None
@@ -156,8 +157,8 @@ class Deadman:
 
 def run_live(
     driver: Driver,
-    front_end: FrontEndLike,
-    controller: Controller | None = None,
+    front_end: FrontEnd,
+    controller: ExcitationController | None = None,
     jobs: Jobs | None = None,
     options: LiveOptions | None = None,
     say: Callable[[str], None] = print,
@@ -220,7 +221,7 @@ def run_live(
                 options.before_motion(lambda: stop.count > 0)
             with real_time:
                 for grant in real_time.grants:
-                    tell(grant.line)
+                    tell(grant)
                 session.catch_up()
                 try:
                     loop.run(options.duration_s)
@@ -235,14 +236,13 @@ def run_live(
             if session is not None and supervisor.loop_board is not None:
                 supervisor.loop_board.write_end(session.ended, session.fault)
             collected = supervisor.finish(hurry=lambda: stop.count > 2)
-        tracking = None if controller is None else controller.tracking()
-        return loop.result(real_time.grants, collected, tracking)
+        return loop.result(real_time.grants, collected)
 
 
 def _prepare(
     driver: Driver,
-    front_end: FrontEndLike,
-    controller: Controller | None,
+    front_end: FrontEnd,
+    controller: ExcitationController | None,
     supervisor: Supervisor,
     session: Session,
 ) -> None:
@@ -320,9 +320,7 @@ class _Loop:
         ended_ns = time.monotonic_ns()
         self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
 
-    def result(
-        self, grants: list[Grant], collected: Any, tracking: dict[str, Any] | None
-    ) -> LiveResult:
+    def result(self, grants: list[str], collected: Any) -> LiveResult:
         """What became of the run."""
         session, supervisor = self._session, self._supervisor
         return LiveResult(
@@ -340,6 +338,6 @@ class _Loop:
             grants=grants,
             collected=collected,
             troubles=supervisor.troubles,
-            tracking=tracking,
+            tracking=session.tracking,
             intake=copy.deepcopy(self._driver.intake),
         )

@@ -11,25 +11,13 @@ import os
 import resource
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
 DEFAULT_PRIORITY = 70  # above the kernel's interrupt threads (50), below its watchdogs (99)
 
 
-@dataclass(frozen=True)
-class Grant:
-    """Answer to a request.
-
-    Attributes:
-        what: "priority", "memory", "core" or "collector".
-        granted: whether it was.
-        line: one clear sentence.
-    """
-
-    what: str
-    granted: bool
-    line: str
+# One clear sentence on a request, and what takes back what was granted; None where nothing was.
+Answer = tuple[str, Callable[[], None] | None]
 
 
 def split_cores(allowed: Sequence[int] | None = None) -> tuple[set[int], set[int]]:
@@ -45,10 +33,9 @@ class RealTime:
         core: the loop's core; None leaves the scheduler its choice.
         priority: of SCHED_FIFO, 1 to 99; None does not ask.
         lock: whether to lock memory.
-        quiet: whether to stop the garbage collector.
 
     Attributes:
-        grants: the answers, in order.
+        grants: the answers' sentences, in order.
     """
 
     def __init__(
@@ -56,15 +43,13 @@ class RealTime:
         core: int | None = None,
         priority: int | None = DEFAULT_PRIORITY,
         lock: bool = True,
-        quiet: bool = True,
     ) -> None:
-        self._core, self._priority, self._lock, self._quiet = core, priority, lock, quiet
+        self._core, self._priority, self._lock = core, priority, lock
         self._undo = ExitStack()
-        self.grants: list[Grant] = []
+        self.grants: list[str] = []
 
     def __enter__(self) -> RealTime:
-        if self._quiet:
-            self._ask(quiet_collector())
+        self._ask(quiet_collector())
         if self._lock:
             self._ask(lock_memory())
         if self._core is not None:
@@ -76,14 +61,14 @@ class RealTime:
     def __exit__(self, *error: object) -> None:
         self._undo.close()
 
-    def _ask(self, answer: tuple[Grant, Callable[[], None] | None]) -> None:
-        grant, undo = answer
-        self.grants.append(grant)
+    def _ask(self, answer: Answer) -> None:
+        line, undo = answer
+        self.grants.append(line)
         if undo is not None:
             self._undo.callback(undo)
 
 
-def request_fifo(priority: int) -> tuple[Grant, Callable[[], None] | None]:
+def request_fifo(priority: int) -> Answer:
     """SCHED_FIFO for the calling thread; its children start ordinary."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
@@ -91,14 +76,12 @@ def request_fifo(priority: int) -> tuple[Grant, Callable[[], None] | None]:
         os.sched_setscheduler(0, policy, os.sched_param(priority))
     except (OSError, ValueError) as error:
         why = "needs root, CAP_SYS_NICE or an rtprio limit (ulimit -r)"
-        return Grant(
-            "priority", False, f"priority: SCHED_FIFO {priority} refused ({error}); {why}"
-        ), None
+        return f"priority: SCHED_FIFO {priority} refused ({error}); {why}", None
     line = f"priority: SCHED_FIFO {priority} granted"
-    return Grant("priority", True, line), lambda: os.sched_setscheduler(0, *before)
+    return line, lambda: os.sched_setscheduler(0, *before)
 
 
-def lock_memory() -> tuple[Grant, Callable[[], None] | None]:
+def lock_memory() -> Answer:
     """mlockall: present pages, and future ones where no limit could make an allocation fail."""
     libc = ctypes.CDLL(None, use_errno=True)
     unlimited = os.geteuid() == 0 or (
@@ -108,16 +91,16 @@ def lock_memory() -> tuple[Grant, Callable[[], None] | None]:
     if libc.mlockall(flags) != 0:
         reason = os.strerror(ctypes.get_errno())
         why = "needs root, CAP_IPC_LOCK or a memlock limit (ulimit -l)"
-        return Grant("memory", False, f"memory: lock refused ({reason}); {why}"), None
+        return f"memory: lock refused ({reason}); {why}", None
     what = "present and future pages" if unlimited else "present pages only (ulimit -l)"
 
     def undo() -> None:
         libc.munlockall()
 
-    return Grant("memory", True, f"memory: locked, {what}"), undo
+    return f"memory: locked, {what}", undo
 
 
-def pin(cores: set[int]) -> tuple[Grant, Callable[[], None] | None]:
+def pin(cores: set[int]) -> Answer:
     """Keep the calling thread on these cores."""
     before = os.sched_getaffinity(0)
     names = ", ".join(map(str, sorted(cores)))
@@ -125,13 +108,13 @@ def pin(cores: set[int]) -> tuple[Grant, Callable[[], None] | None]:
         os.sched_setaffinity(0, cores)
     except (OSError, ValueError) as error:
         have = ", ".join(map(str, sorted(before)))
-        return Grant("core", False, f"core: {names} refused ({error}); have: {have}"), None
+        return f"core: {names} refused ({error}); have: {have}", None
     shared = " (the only one: the workers share it)" if before <= cores else ""
     line = f"core: the loop runs on core {names}{shared}"
-    return Grant("core", True, line), lambda: os.sched_setaffinity(0, before)
+    return line, lambda: os.sched_setaffinity(0, before)
 
 
-def quiet_collector() -> tuple[Grant, Callable[[], None] | None]:
+def quiet_collector() -> Answer:
     """Collect once, then leave everything that lives alone and collect no more."""
     enabled = gc.isenabled()
     gc.collect()
@@ -143,4 +126,4 @@ def quiet_collector() -> tuple[Grant, Callable[[], None] | None]:
         if enabled:
             gc.enable()
 
-    return Grant("collector", True, "collector: frozen and off"), undo
+    return "collector: frozen and off", undo

@@ -3,8 +3,7 @@
 The producer never waits and takes no lock. `head` counts records ever written and belongs to
 the producer; `taken` and `tail` count records ever taken and ever given back and belong to the
 consumer. Between the two lies what a consumer has taken but its successor would need again. A
-full ring refuses the new record and counts it in `overruns`: what was not given back is never
-overwritten.
+full ring refuses the new record: what was not given back is never overwritten.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from adapter.physics.kernels import jit
 from adapter.realtime.shared import SharedBlock, fence, free_bytes
 
 # Places in the header; what different processes write lies in different cache lines.
-HEAD, TAIL, TAKEN, SKIPPED, OVERRUNS, FINISHED, ROWS, SIZE = 0, 8, 9, 10, 16, 17, 24, 25
+HEAD, TAIL, TAKEN, SKIPPED, FINISHED, ROWS, SIZE = 0, 8, 9, 10, 17, 24, 25
 HEADER_WORDS = 32
 HEADER_BYTES = 8 * HEADER_WORDS
 
@@ -27,7 +26,6 @@ def put(header, table, record):
     """Copy a record (size,) into the ring; False where it is full."""
     head, rows = header[HEAD], table.shape[0]
     if head - header[TAIL] >= rows:
-        header[OVERRUNS] += 1
         return False
     place = head % rows
     for i in range(table.shape[1]):
@@ -113,7 +111,7 @@ class Ring:
         return ring
 
     def push(self, record: Array) -> bool:
-        """Producer: add a record (size,), C order; False where the ring is full (counted)."""
+        """Producer: add a record (size,), C order; False where the ring is full."""
         return bool(put(self._header, self._table, record))
 
     def finish(self) -> None:
@@ -206,11 +204,6 @@ class Ring:
     def unread(self) -> int:
         """Records that wait to be taken."""
         return self.pushed - self.taken
-
-    @property
-    def overruns(self) -> int:
-        """Records refused because the ring was full."""
-        return int(self._header[OVERRUNS])
 
     def close(self) -> None:
         """Let go of the ring in this process; may be called more than once."""

@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any
 
-from adapter.control.controller import Controller
+from adapter.control.controller import ExcitationController
 from adapter.control.sample_clock import SampleClock
 from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
-from adapter.realtime.jobs import LearnerLike
-from adapter.signals.records import StateLayout
+from adapter.realtime.following import FollowingObserver
+from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
 STOP_LIMIT_S = 5.0  # a safe stop that takes longer is left to the driver
@@ -35,26 +34,6 @@ class Ended(StrEnum):
     END_OF_STREAM = "end_of_stream"
 
 
-class FrontEndLike(Protocol):
-    """What turns samples into filtered states; `adapter.signals.front_end.FrontEnd` for one."""
-
-    layout: StateLayout
-
-    def step(self, sample: JointSample) -> Array:
-        """The filtered states (k, size) that this sample completes."""
-
-
-class ObserverLike(Protocol):
-    """Who says what pushes the arm; `adapter.realtime.following.FollowingObserver` for one."""
-
-    @property
-    def alarm(self) -> str | None:
-        """Why a motion has to end; None while all is well."""
-
-    def step(self, sample: JointSample) -> Array:
-        """External torque (n,) N m with this sample."""
-
-
 class Session:
     """Ticks of one run.
 
@@ -70,6 +49,7 @@ class Session:
         observer: takes each sample; None where nobody wants to know what pushes the arm.
         samples: read so far.
         set_aside: read to get ready, before the first tick; nobody else saw them.
+        passed_on: filtered states.
         elapsed_s: on the arm's own stamps; one that leaps by more than a second counts a period.
         ended: why the run came to its end, see `Ended`.
         fault: what the driver or the controller said, or None.
@@ -81,16 +61,16 @@ class Session:
     def __init__(
         self,
         driver: Driver,
-        front_end: FrontEndLike,
-        controller: Controller | None,
+        front_end: FrontEnd,
+        controller: ExcitationController | None,
         pass_on: Callable[[Array], None],
         keep: Callable[[JointSample, Array | None, Array | None], None],
         duration_s: float | None,
     ) -> None:
-        self.observer: ObserverLike | None = None
+        self.observer: FollowingObserver | None = None
         self._driver, self._front_end, self._controller = driver, front_end, controller
         self._pass_on, self._keep, self._duration_s = pass_on, keep, duration_s
-        self.samples, self.set_aside, self.elapsed_s = 0, 0, 0.0
+        self.samples, self.set_aside, self.passed_on, self.elapsed_s = 0, 0, 0, 0.0
         self.ended = Ended.DURATION
         self.fault: str | None = None
         self.began_ns = self.had_ns = self.stepped_ns = 0
@@ -170,6 +150,7 @@ class Session:
         self.samples += 1
         for state in states:
             self._pass_on(state)
+        self.passed_on += len(states)
         external = None if self.observer is None else self.observer.step(sample)
         command, trouble = self._move(sample)
         self._keep(sample, command, external)
@@ -189,6 +170,11 @@ class Session:
         except (ControlError, DriverError) as error:
             return None, str(error)
         return tau, None
+
+    @property
+    def tracking(self) -> dict[str, Any] | None:
+        """See `ExcitationController.tracking`; None in passive mode."""
+        return None if self._controller is None else self._controller.tracking()
 
     def begin_stop(self, why: Ended) -> None:
         """Begin the safe stop; the run ends when the arm rests. Later calls change nothing."""
@@ -226,33 +212,21 @@ def stop_arm(driver: Driver, session: Session | None) -> None:
             session.ended, session.fault = Ended.DRIVER_ERROR, str(error) or type(error).__name__
 
 
-@dataclass(frozen=True)
-class LockstepResult:
-    """What a lockstep run did; fields as in `LiveResult`."""
-
-    samples: int
-    set_aside: int
-    passed_on: int
-    ended: Ended
-    fault: str | None
-    tracking: dict[str, Any] | None
-
-
 def run_lockstep(
     driver: Driver,
-    front_end: FrontEndLike,
-    learner: LearnerLike | None = None,
-    controller: Controller | None = None,
+    front_end: FrontEnd,
+    learner: Any = None,
+    controller: ExcitationController | None = None,
     duration_s: float | None = None,
     *,
     each: Callable[[JointSample, Array | None], None] | None = None,
-) -> LockstepResult:
+) -> Session:
     """Run an arm as fast as it goes; the learner sees what it would see live.
 
     Args:
         driver: not connected yet; stopped but left open at the end, for questions to it.
         front_end: fresh.
-        learner: takes each filtered state before the next sample is read.
+        learner: its `step` takes each filtered state before the next sample is read.
         controller: moves the arm; None listens.
         duration_s: of the arm's own stamps, until the safe stop begins; None runs to the end of
             the stream.
@@ -261,11 +235,8 @@ def run_lockstep(
     Raises:
         DriverError: the arm cannot be reached.
     """
-    passed_on = 0
 
     def learn(record: Array) -> None:
-        nonlocal passed_on
-        passed_on += 1
         if learner is not None:
             learner.step(record)
 
@@ -282,7 +253,4 @@ def run_lockstep(
             pass
     finally:
         stop_arm(driver, session)
-    tracking = None if controller is None else controller.tracking()
-    return LockstepResult(
-        session.samples, session.set_aside, passed_on, session.ended, session.fault, tracking
-    )
+    return session

@@ -455,11 +455,3 @@ class SnapshotReader(Board):
     def __del__(self) -> None:
         if hasattr(self, "_estimate"):
             self.close()
-
-
-def nothing_known(n: int, bodies: int, effects: int) -> Snapshot:
-    """A snapshot of NaN for n joints, to be completed with `dataclasses.replace`."""
-    per_joint, per_body = np.full((n, 6), np.nan), np.full((bodies, 10), np.nan)
-    per_effect = np.full((effects, n), np.nan)
-    bodies_too = per_joint, per_joint, per_body, per_body
-    return Snapshot(*bodies_too, per_effect, per_effect, per_effect, np.full(n, np.nan))

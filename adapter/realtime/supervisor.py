@@ -26,7 +26,6 @@ from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotError, SnapshotWrite
 from adapter.realtime.worker import (
     RESTARTS,
     RestartableWorker,
-    RestartPolicy,
     Worker,
     WorkerError,
     worker_starter,
@@ -138,9 +137,9 @@ class Supervisor:
             self.display = Worker("display process", show, self._cores, DISPLAY_NICE)
         if jobs.view is not None:
             name, task = "view process", DisplayTask(jobs.view, *names)
-            policy = self._policy("nothing more is shown", RESTARTS)
             build = partial(Worker, name, task, self._cores)
-            self.view = RestartableWorker(name, lambda k: build(), policy)
+            lost = "nothing more is shown"
+            self.view = self._restartable(name, lambda k: build(), RESTARTS, lost)
 
     def _wait_for_view(self, cancelled: Callable[[], bool]) -> None:
         """Until it shows; a run does without one that cannot."""
@@ -161,8 +160,8 @@ class Supervisor:
             self._folder = Path(tempfile.mkdtemp(prefix="adapter-learner-"))
         task = LearnerTask(job, ring.name, board, self._folder)
         name = "learner process"
-        policy = self._policy("nothing more is learned", RESTARTS if lasting else 0)
-        return RestartableWorker(name, lambda k: Worker(name, task, self._cores), policy)
+        most, lost = RESTARTS if lasting else 0, "nothing more is learned"
+        return self._restartable(name, lambda k: Worker(name, task, self._cores), most, lost)
 
     def _start_recorder(
         self, job: RecordingJob, ring: Ring, board: str | None
@@ -174,11 +173,14 @@ class Supervisor:
             task = RecorderTask(job.part(k), ring.name, board, loop, *self._names)
             return Worker(name, task, self._cores, RECORDER_NICE)
 
-        return RestartableWorker(name, build, self._policy("nothing more is recorded", RESTARTS))
+        return self._restartable(name, build, RESTARTS, "nothing more is recorded")
 
-    def _policy(self, lost: str, most: int) -> RestartPolicy:
+    def _restartable(
+        self, name: str, build: Callable[[int], Worker], most: int, lost: str
+    ) -> RestartableWorker:
         assert self._starter is not None
-        return RestartPolicy(self._starter, most, self._tell, f"the arm goes on, {lost}")
+        lost = f"the arm goes on, {lost}"
+        return RestartableWorker(name, build, self._starter, most, self._tell, lost)
 
     @property
     def restarts(self) -> int:
@@ -192,13 +194,13 @@ class Supervisor:
 
     def _new_board(self, learner: LearnerJob) -> SnapshotWriter:
         """Where the estimate is published; under another name where another run has the usual."""
-        parts = self._names[0], learner.effect_names, learner.bodies
+        parts, name = (self._names[0], learner.effect_names), self._options.snapshot_name
         try:
-            return SnapshotWriter.create(*parts, self._options.snapshot_name)
+            return SnapshotWriter.create(*parts, name=name)
         except SnapshotError as error:
-            if self._options.snapshot_name is None:
+            if name is None:
                 raise
-            board = SnapshotWriter.create(*parts, None)
+            board = SnapshotWriter.create(*parts, name=None)
             self._say(f"{error}; this run publishes its estimate as '{board.name}'")
             return board
 

@@ -32,14 +32,14 @@ class Histogram:
         self.total_ns = 0
         self.max_ns = 0
 
-    def add(self, ns: int) -> None:
-        """Count one duration; a negative one counts as zero."""
+    def add(self, ns: int, times: int = 1) -> None:
+        """Count a duration, so many times; a negative one counts as zero."""
         if ns < 0:
             ns = 0
         shift = ns.bit_length() - BITS - 1
-        self._bins[ns if shift <= 0 else (shift << BITS) + (ns >> shift)] += 1
-        self.count += 1
-        self.total_ns += ns
+        self._bins[ns if shift <= 0 else (shift << BITS) + (ns >> shift)] += times
+        self.count += times
+        self.total_ns += ns * times
         if ns > self.max_ns:
             self.max_ns = ns
 
@@ -136,9 +136,7 @@ class Timing:
 
     def __init__(self, bins: NDArray[np.int64] | None = None) -> None:
         rows = np.zeros((len(COUNTED), BINS), np.int64) if bins is None else bins
-        self._tick, self._loop, self._plant, self._late, self._period, self._age = map(
-            Histogram, rows
-        )
+        self._of = dict(zip(COUNTED, map(Histogram, rows), strict=True))
         self._began: int | None = None
 
     def add(
@@ -147,32 +145,22 @@ class Timing:
         """One tick: instants (ns) of its begin, of the filtered state, of its end; physics time;
         age of its sample when the loop had it, None where that has no meaning."""
         if self._began is not None:
-            self._period.add(began - self._began)
+            self._of["period_us"].add(began - self._began)
         self._began = began
-        self._tick.add(stepped - began - plant_ns)
-        self._loop.add(ended - began - plant_ns)
+        self._of["tick_us"].add(stepped - began - plant_ns)
+        self._of["loop_us"].add(ended - began - plant_ns)
         if plant_ns:
-            self._plant.add(plant_ns)
+            self._of["plant_us"].add(plant_ns)
         if age_ns is not None:
-            self._age.add(age_ns)
+            self._of["age_us"].add(age_ns)
 
     def late(self, ns: int) -> None:
         """A tick began this long after its deadline."""
-        self._late.add(ns)
+        self._of["lateness_us"].add(ns)
 
     def report(self, missed: int = 0, missed_own: int = 0) -> TimingReport:
         """What was collected so far."""
-        period = self._period.summary_us()
-        count = self._period.count
-        period["mean"] = 1e-3 * self._period.total_ns / count if count else None
-        return TimingReport(
-            self._loop.count,
-            missed,
-            missed_own,
-            self._tick.summary_us(),
-            self._loop.summary_us(),
-            self._plant.summary_us(),
-            self._late.summary_us(),
-            period,
-            self._age.summary_us(),
-        )
+        found, period = {k: x.summary_us() for k, x in self._of.items()}, self._of["period_us"]
+        mean_us = 1e-3 * period.total_ns / period.count if period.count else None
+        found["period_us"]["mean"] = mean_us
+        return TimingReport(self._of["loop_us"].count, missed, missed_own, **found)

@@ -13,7 +13,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from enum import StrEnum
 from multiprocessing.connection import Connection
 from typing import Any
@@ -237,39 +236,33 @@ def worker_starter(cores: set[int]) -> ThreadPoolExecutor:
     return starter
 
 
-@dataclass(frozen=True)
-class RestartPolicy:
-    """What happens when a worker dies.
-
-    Attributes:
-        starter: starts those that follow.
-        most: how many may follow.
-        tell: takes a sentence on each that died.
-        lost: what it means for the run when nobody follows.
-    """
-
-    starter: ThreadPoolExecutor
-    most: int
-    tell: Callable[[str], None]
-    lost: str
-
-
 class RestartableWorker:
     """A worker that is followed by another when it dies.
 
     Args:
         name: of the worker, for messages.
         build: starts worker number k = 0, 1, ...
-        policy: what happens when it dies.
+        starter: starts those that follow; most: how many may.
+        tell: takes a sentence on each that died; lost: what it means for the run when nobody
+            follows.
 
     Attributes:
         restarts: how many followed.
         worker: the present one, None while there is none.
     """
 
-    def __init__(self, name: str, build: Callable[[int], Worker], policy: RestartPolicy) -> None:
+    def __init__(
+        self,
+        name: str,
+        build: Callable[[int], Worker],
+        starter: ThreadPoolExecutor,
+        most: int,
+        tell: Callable[[str], None],
+        lost: str,
+    ) -> None:
         self.name, self.restarts = name, 0
-        self._build, self._policy = build, policy
+        self._build, self._starter, self._most = build, starter, most
+        self._tell, self._lost = tell, lost
         self._next: Future[Worker] | None = None  # being started
         self._started: list[Future[Worker]] = []
         self.worker: Worker | None = build(0)
@@ -313,21 +306,21 @@ class RestartableWorker:
                 future.result().kill()
 
     def _replace(self, worker: Worker) -> None:
-        policy, trouble = self._policy, worker.trouble or f"the {self.name} ended early"
-        if worker.replaceable and self.restarts < policy.most:
+        trouble = worker.trouble or f"the {self.name} ended early"
+        if worker.replaceable and self.restarts < self._most:
             self.restarts += 1
             k = self.restarts
-            policy.tell(f"{trouble}; a new one starts ({k} of {policy.most})")
-            self._next = policy.starter.submit(self._build, k)
+            self._tell(f"{trouble}; a new one starts ({k} of {self._most})")
+            self._next = self._starter.submit(self._build, k)
             self._started.append(self._next)
         else:
-            policy.tell(f"{trouble}; {policy.lost}")
+            self._tell(f"{trouble}; {self._lost}")
 
     def _await(self, future: Future[Worker], hurry: Callable[[], bool]) -> None:
         while not wait([future], POLL_S).done:
             if hurry():
                 self._next = None
-                self._policy.tell(f"nobody waited for a new {self.name}; {self._policy.lost}")
+                self._tell(f"nobody waited for a new {self.name}; {self._lost}")
                 return
         self._take(future)
 
@@ -337,4 +330,4 @@ class RestartableWorker:
             self.worker = future.result()
         else:
             why = f"{type(error).__name__}: {error}"
-            self._policy.tell(f"a new {self.name} could not start: {why}; {self._policy.lost}")
+            self._tell(f"a new {self.name} could not start: {why}; {self._lost}")

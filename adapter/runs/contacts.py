@@ -19,7 +19,6 @@ from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import Frames, JointMotion, base_at_rest, regressors, wrench_torques
-from drivers.interface import JointSample
 
 ADOPT_EVERY = 100  # samples
 
@@ -116,11 +115,6 @@ class ReplayObserver:
         effects = learner.settings.effects
         self.observer, self._learner = ContactObserver(documented, effects), learner
         self._samples = 0
-
-    def step(self, sample: JointSample) -> None:
-        """Take a sample that the learner has seen."""
-        signals = np.array([[sample.q, sample.dq, sample.tau]])
-        self.step_each(np.array([sample.stamp_ns]), signals)
 
     def step_each(self, stamp_ns: NDArray[np.int64], signals: Array) -> None:
         """Take samples that the learner has seen: stamps (m,), and q, dq, tau (m, 3, n) of each."""

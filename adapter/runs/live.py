@@ -239,8 +239,7 @@ def news_of(learner: OnlineLearner) -> dict[str, Any]:
     """What was found so far, for whoever looks at the run; see `SnapshotReader.read_news`."""
     reports = [] if learner.watch is None else learner.watch.reports
     findings = list(reports[-MOST_FINDINGS:])
-    stamps = [change.stamp_ns for change in learner.changes]
-    changes = changes_at(stamps, learner.theta.payload, reports)[-MOST_FINDINGS:]
+    changes = changes_at(learner.changes, learner.theta.payload, reports)[-MOST_FINDINGS:]
     load = changes[-1].get("payload") if changes else None
     news = {
         "theta_started": learner.theta_started_ns is not None,

@@ -42,7 +42,7 @@ class Outcome:
     """Everything a report, a model file or a score needs; plain arrays, so that it can travel.
 
     Attributes:
-        learned, updates: states learned from; ADAM updates.
+        learned: states learned from.
         start_lam, lam: (n, 6) λ at first and at last.
         lam_covariance, lam_identifiable: (n, 6, 6) of (turn, shift) in the parents' axes.
         lam_rank, lam_converged, lam_measured: directions shown; settled; learned from sensors.
@@ -75,7 +75,6 @@ class Outcome:
     """
 
     learned: int
-    updates: int
     start_lam: Array
     lam: Array
     lam_covariance: Array
@@ -132,7 +131,6 @@ def collect(learner: OnlineLearner) -> Outcome:
     bodies, information = theta.theta_given(known.effects)
     return Outcome(
         learned=learner.learned,
-        updates=schema.updates,
         start_lam=schema.start_lam,
         lam=schema.lam,
         lam_covariance=in_parents(schema.R0, schema.covariance()),
@@ -157,7 +155,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         least_squares=batch,
         held=known.held,
         payload=known.payload,
-        changes_ns=tuple(change.stamp_ns for change in learner.changes),
+        changes_ns=tuple(learner.changes),
         rebuilds=learner.rebuilds,
         schema_trace=_course_of_lam(learner),
         schema_known=learner.schema_trace.rows[:, 1 + 12 * learner.tree.n :].copy(),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from adapter.effects.active import lasting_effects, with_bodies
-from adapter.learning.learner import Filtered, KnownArm, OnlineLearner
+from adapter.learning.learner import OnlineLearner
+from adapter.learning.theta import Filtered, KnownArm
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
@@ -17,6 +16,7 @@ from adapter.gap.monitor import Monitor
 from adapter.learning.checkpoint import load_checkpoint
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.realtime.timing import Histogram
 from adapter.runs.batch import learn_batch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.contacts import ADOPT_EVERY, ReplayObserver, contacts_of
@@ -40,37 +40,6 @@ MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to
 Progress = Callable[[int], None]
 
 
-class TickTimes:
-    """How long ticks took, in bins that are `BIN` of their size wide, however many there were.
-
-    Attributes:
-        count: of ticks; longest_ns: of them.
-    """
-
-    BIN = 0.01
-
-    def __init__(self) -> None:
-        self.count, self.longest_ns = 0, 0
-        self._bins = np.zeros(0, dtype=np.int64)
-
-    def add(self, tick_ns: NDArray[np.int64]) -> None:
-        """Count (k,) times."""
-        if not len(tick_ns):
-            return
-        places = np.floor(np.log(np.maximum(tick_ns, 1)) / np.log1p(self.BIN)).astype(int)
-        found = np.bincount(places, minlength=len(self._bins))
-        found[: len(self._bins)] += self._bins
-        self._bins, self.count = found, self.count + len(tick_ns)
-        self.longest_ns = max(self.longest_ns, int(tick_ns.max()))
-
-    def percentile_ns(self, share: float) -> float:
-        """The time that `share` percent of the ticks did not exceed; the longest one exactly."""
-        if share >= 100.0:
-            return float(self.longest_ns)
-        place = np.searchsorted(np.cumsum(self._bins), 0.01 * share * self.count)
-        return float((1.0 + self.BIN) ** (place + 0.5))
-
-
 @dataclass(frozen=True)
 class Replay:
     """What a replay found.
@@ -88,7 +57,7 @@ class Replay:
     outcome: Outcome
     pipeline: Pipeline
     samples: int
-    ticks: TickTimes
+    ticks: Histogram
     wall_s: float
     span_s: float
     contacts: list[dict[str, Any]] = field(default_factory=list)
@@ -195,7 +164,7 @@ def replay(
         observer = ReplayObserver(documented, pipeline.learner)
     started = time.perf_counter()
     progress = progress or (lambda done: None)
-    ticks = TickTimes()
+    ticks = Histogram()
     if every == 1:
         ticks = _exact(log, stop, pipeline, progress, observer)
     else:
@@ -209,24 +178,22 @@ def replay(
 
 def _exact(
     log: Log, stop: int, pipeline: Pipeline, progress: Progress, observer: ReplayObserver | None
-) -> TickTimes:
-    ticks = TickTimes()
+) -> Histogram:
+    ticks = Histogram()
     for start in range(0, stop, AT_ONCE):
         progress(start)
         piece = log.piece(start, min(start + AT_ONCE, stop))
         signals = np.stack([piece.q, piece.dq, piece.tau], axis=1)
-        tick_ns = np.zeros(len(piece), np.int64)
         # the observer goes on with what is learned behind every so-many samples
         for begin in range(0, len(piece), ADOPT_EVERY):
             own = slice(begin, min(begin + ADOPT_EVERY, len(piece)))
             part, before = piece.piece(own.start, own.stop), time.perf_counter_ns()
             states = _filtered(part, pipeline.front_end)
-            tick_ns[own] = (time.perf_counter_ns() - before) // len(part)
+            ticks.add((time.perf_counter_ns() - before) // len(part), len(part))
             if len(states):
                 pipeline.learner.step_each(states)
             if observer is not None:
                 observer.step_each(part.stamp_ns, signals[own])
-        ticks.add(tick_ns)
     return ticks
 
 

@@ -37,11 +37,6 @@ class Bristles(NamedTuple):
     direction: Array
     held: Array
 
-    @classmethod
-    def unknown(cls, n: int) -> Bristles:
-        """Not bent, before anything is known."""
-        return cls(np.full(n, np.nan), np.zeros(n), np.zeros(n), np.zeros((len(WAYS_RAD), n)))
-
 
 @jit
 def wind(dt_s, q, dq, bristles, bent):

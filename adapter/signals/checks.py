@@ -155,36 +155,33 @@ def rules_of(limits: Limits, settings: FrontEndSettings, joint_filter: JointFilt
     return Rules(np.array(allowed), effort, floor, settings.rest_dq, gap_ns, *per, gains)
 
 
-def packed(rules: Rules) -> Array:
-    """The rules in one array; its inverse is in `unpacked`."""
-    tables = (rules.range.ravel(), rules.effort, rules.floor.ravel())
-    numbers = rules.rest_dq, rules.gap_ns, rules.states, rules.samples
-    return np.concatenate([*tables, [*numbers, *rules.gains]])
+def packed(rules: Rules) -> tuple[Array, Array]:
+    """The rules by joint (8, n) and the others (8,); its inverse is in `unpacked`."""
+    numbers = rules.rest_dq, rules.gap_ns, rules.states, rules.samples, *rules.gains
+    return np.vstack([rules.range, rules.effort, rules.floor]), np.array(numbers, dtype=np.float64)
 
 
-# Rows of n in the packed `Memory`, in this order: last, good, doubted, usual (3 each), fastest,
-# then of the bristles place, edge, direction (1 each) and held. Behind them four rows of what
-# passes the filter: the joints' 3 n, the base's motion, b numbers, and the bristles', K n.
-BY_JOINT, FILTERED = 16 + len(WAYS_RAD), 4
+def new_memory(n: int, base: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """`Memory` of n joints and so many numbers of a base, of nothing yet, as `unpacked` takes it.
 
-
-def room(n: int, base: int) -> int:
-    """Numbers that `Memory` of n joints and so many of a base takes."""
-    return BY_JOINT * n + FILTERED * (3 * n + base + len(WAYS_RAD) * n)
+    Rows of n: last, good, doubted, usual (3 each), fastest, then of the bristles place, edge,
+    direction (1 each) and held. Four rows of what passes the filter: the joints' 3 n, the base's
+    motion, and the bristles', K n. Whole numbers.
+    """
+    ways = len(WAYS_RAD)
+    whole = np.zeros(n + MARKS + 2, dtype=np.int64)
+    return np.zeros((16 + ways, n)), np.zeros((4, 3 * n + base + ways * n)), whole
 
 
 @jit
-def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 8,), (`room`,) and (n + MARKS + 2,)."""
-    n = whole.shape[0] - MARKS - 2
-    rest_dq, gap_ns, states, samples = rules[8 * n], rules[8 * n + 1], rules[8 * n + 2], rules[-5]
-    gains = Gains(rules[-4], rules[-3], int(rules[-2]), int(rules[-1]))
-    allowed, floor = rules[: 4 * n].reshape(4, n), rules[5 * n : 8 * n].reshape(3, n)
-    per = int(gap_ns), int(states), int(samples)
-    own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, per[0], per[1], per[2], gains)
+def unpacked(rules, memory):
+    """`Rules` and `Memory` as views of what `packed` and `new_memory` gave."""
+    (table, numbers), (rows, wide, whole) = rules, memory
+    n = table.shape[1]
+    gains = Gains(numbers[4], numbers[5], int(numbers[6]), int(numbers[7]))
+    per = int(numbers[1]), int(numbers[2]), int(numbers[3])
+    own = Rules(table[:4], table[4], table[5:], numbers[0], per[0], per[1], per[2], gains)
     since, marks, times = whole[:n], whole[n : n + MARKS], whole[n + MARKS :]
-    rows = memory[: BY_JOINT * n].reshape(BY_JOINT, n)
-    wide = memory[BY_JOINT * n :].reshape(FILTERED, -1)
     state = FilterState(times, wide[1], wide[2], wide[3])
     bristles = Bristles(rows[13], rows[14], rows[15], rows[16:])
     tables = rows[:3], rows[3:6], rows[6:9], rows[9:12]

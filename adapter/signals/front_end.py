@@ -12,15 +12,14 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import borrowed, jit
 from adapter.signals.bristles import wind
 from adapter.signals.checks import (
-    MARKS,
     STREAK,
     Mark,
     Verdict,
     believed,
     in_order,
     judge,
+    new_memory,
     packed,
-    room,
     rules_of,
     unpacked,
 )
@@ -158,19 +157,19 @@ def worth(stamp, x, settled, rules, memory):
 
 
 @jit
-def process(signals, rules, memory, whole, records, answers):
+def process(signals, rules, memory, records, answers):
     """Check and filter samples in order; one call serves one sample or a whole recording.
 
     Takes few plain arrays, since handing over a record of many takes longer than the work itself.
 
     Args:
         signals: (m, 3 n + b) q, dq, tau, and the b = 9 numbers of a base that floats.
-        rules, memory, whole: see `packed` and `unpacked`.
+        rules, memory: see `packed` and `new_memory`.
         records: (m K, size), filled from the first on, K for each sample whose verdict is GOOD.
         answers: (m, 4) int64 [stamp ns, verdict, stamps before and behind a gap]; the first is
             given, the others are filled.
     """
-    own, kept = borrowed(unpacked(rules, memory, whole))
+    own, kept = borrowed(unpacked(rules, memory))
     signals, records, answers = borrowed((signals, records, answers))
     end = own.states
     for i in range(signals.shape[0]):
@@ -209,8 +208,8 @@ class FrontEnd:
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         base = BASE if documented.tree.floating else 0
-        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + MARKS + 2, dtype=np.int64)
-        self._memory = unpacked(self._packed, self._kept, self._whole)[1]
+        self._kept = new_memory(n, base)
+        self._memory = unpacked(self._packed, self._kept)[1]
         self._memory.last[:] = np.nan
         self._memory.bristles.place[:] = np.nan
         self._memory.filter.times[:] = NEVER
@@ -283,7 +282,7 @@ class FrontEnd:
                 "nanoseconds (time.monotonic_ns())"
             )
         answers[0, 0] = sample.stamp_ns
-        process(signals, self._packed, self._kept, self._whole, self._records, answers)
+        process(signals, self._packed, self._kept, self._records, answers)
         if answers[0, 1]:
             self._refuse(answers[0, 1], sample, answers[0, 2:])
             return self._records[:0]
@@ -314,7 +313,7 @@ class FrontEnd:
         records = self.layout.new(states * len(q))
         answers = np.zeros((len(q), 4), dtype=np.int64)
         answers[:, 0] = stamp_ns
-        process(signals, self._packed, self._kept, self._whole, records, answers)
+        process(signals, self._packed, self._kept, records, answers)
         for i in np.flatnonzero(answers[:, 1]):
             sample = JointSample(int(stamp_ns[i]), q[i], dq[i], tau[i])
             self._refuse(answers[i, 1], sample, answers[i, 2:])

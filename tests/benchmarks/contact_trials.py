@@ -67,7 +67,8 @@ def trial(seed: int, newton: float, learn_s: float, seconds: float) -> dict[str,
                 learner.step(state)
 
     def each(sample: JointSample, command: Array | None) -> None:
-        learned.step(sample)
+        signals = np.array([[sample.q, sample.dq, sample.tau]])
+        learned.step_each(np.array([sample.stamp_ns]), signals)
         documented.step(sample)
 
     driver = PyBulletArm(arm.plant())

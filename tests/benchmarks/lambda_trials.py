@@ -26,8 +26,9 @@ import numpy as np
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
-from adapter.learning.learner import Filtered, OnlineLearner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
+from adapter.learning.theta import Filtered
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.urdf import read_urdf
 from adapter.physics.identifiability import random_motion

@@ -138,7 +138,7 @@ def announced_at_rate(log: Log, rate: int, robot: SelfModel) -> dict[str, Any]:
     for state in pipeline.front_end.step_table(*signals):
         pipeline.learner.step(state)
     learner, begin_ns = pipeline.learner, thin.stamp_ns[0]
-    changes = [round(1e-9 * (x.stamp_ns - begin_ns), 3) for x in learner.changes]
+    changes = [round(1e-9 * (stamp_ns - begin_ns), 3) for stamp_ns in learner.changes]
     return {"rate": rate, "changes": changes, "looked_at": learner.change.samples}
 
 

@@ -13,7 +13,7 @@ from adapter.cli.publishing import Publisher, publisher_job, together
 from adapter.model.robots import documented
 from adapter.realtime.run_messages import ShownArm
 from adapter.realtime.showing import DisplayJob, View
-from adapter.realtime.snapshot import ExternalTorque, nothing_known
+from adapter.realtime.snapshot import ExternalTorque
 from adapter.signals.records import StateLayout
 from drivers.files.estimates import estimate_values
 from drivers.files.messages import decode
@@ -21,6 +21,7 @@ from drivers.files.ros_types import ESTIMATE, FLOAT64_MULTI_ARRAY, TF, WRENCH_ST
 from drivers.ros2.settings import parse
 from drivers.ros2.wire import Network
 from tests.helpers.hardware_rigs import free_domain
+from tests.helpers.live_learners import nothing_known
 
 STAMP_NS = 1_700_000_000_123_456_789
 

@@ -8,15 +8,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.control.observer import ContactObserver, ObserverSettings
-from adapter.errors import SettingsError
+from adapter.control.observer import ContactObserver
 from adapter.realtime.following import FollowingObserver
-from adapter.realtime.snapshot import SnapshotReader, SnapshotWriter, nothing_known
+from adapter.realtime.snapshot import SnapshotReader, SnapshotWriter
 from adapter.runs.contacts import Kind, kind_of
 from drivers.interface import JointSample
 from sim.effects import payload
 from sim.truth import panda
 from tests.helpers.arm_data import Motion, arm, panda_model, pin_model, record, rnea
+from tests.helpers.live_learners import nothing_known
 
 STD = np.full(7, 0.05)
 NONE = np.zeros((0, 7))
@@ -158,13 +158,6 @@ def test_friction_that_is_documented_and_learned_counts_once() -> None:
     assert np.abs(data.dq[:, 4:]).max() > 1.0
     assert max(np.abs(observer.step(sample)[4:]).max() for sample in samples) < 0.3
     assert observer.contacts == []
-
-
-@pytest.mark.parametrize("name", ["bandwidth_hz", "sigmas", "hold_s"])
-def test_settings_are_judged(name: str) -> None:
-    """None may be zero."""
-    with pytest.raises(SettingsError, match=name):
-        ObserverSettings(**{name: 0.0})
 
 
 def test_a_contact_ends_a_motion_where_that_is_asked_for() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adapter.control.reading_gate import ReadingGate, ReadingJudge
+from adapter.control.reading_gate import ReadingGate
 from adapter.errors import ControlError
 from drivers.damiao.timing import at_instant
 from drivers.interface import JointSample
@@ -19,7 +19,7 @@ def angle(t_s: float) -> tuple[float, float]:
 
 def why_it_stops(hole: tuple[int, int], jump_rad: float, at: int = 300) -> str:
     """What is said where one joint's replies are missing in these ticks, and jump in one."""
-    gate = ReadingGate(ReadingJudge(np.full(N, 2.5), np.full(N, 50.0), np.full(N, 60.0)), PERIOD_NS)
+    gate = ReadingGate(np.full(N, 2.5), np.full(N, 50.0), np.full(N, 60.0), PERIOD_NS)
     readings = [[(0, *angle(0.0), 1.0)] * 2 for _ in range(N)]
     for k in range(1, 400):
         for j in range(N):

@@ -190,7 +190,7 @@ def test_a_constant_difference_is_no_push_and_effort_rises_with_agreement() -> N
     for k in range(8000):
         watch.now[Now.MEASURED] = min(k / 4000, 1.0) * off
         watch.now[Now.WANTED] = 0.0
-        rooms.append(float(watch.room[0]))
+        rooms.append(float(watch._bounds[0, 0]))
         watch.step(STEP, 1e-3)
     np.testing.assert_allclose(watch.now[Now.OFFSET], off, rtol=0.03)
     assert rooms[0] == 0.5 * LIMITS.effort[0] and np.all(np.diff(rooms) >= -1e-9)

@@ -15,7 +15,7 @@ from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.model.robots import documented
-from adapter.realtime.session import LockstepResult, run_lockstep
+from adapter.realtime.session import Session, run_lockstep
 from adapter.signals.front_end import FrontEnd
 from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
@@ -55,7 +55,7 @@ def on_a_line(monkeypatch):
         yield made
 
 
-def excited(driver: Lockstep, seed: int, seconds: float, each) -> LockstepResult:
+def excited(driver: Lockstep, seed: int, seconds: float, each) -> Session:
     """What becomes of so much excitation."""
     controller = ExcitationController(
         MotionLimits.of(PANDA), ExcitationSettings(seed=seed), expected=ModelFeedforward.of(PANDA)

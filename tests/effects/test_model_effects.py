@@ -14,9 +14,9 @@ from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.known_effects import KnownEffects, believed, learnable, not_taken_off
-from adapter.learning.learner import KnownArm, OnlineLearner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
-from adapter.learning.theta import STEP_SMOOTHING
+from adapter.learning.theta import STEP_SMOOTHING, KnownArm
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
 from adapter.physics.rigid_arm import RigidArm

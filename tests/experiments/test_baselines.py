@@ -54,7 +54,7 @@ def samples(seed: int, count: int) -> TreeData:
     base = BodyMotion(*(rng.normal(size=(count, 3)) for _ in range(4)))
     tau = _pinocchio(lam, theta, q, dq, ddq, base)
     signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
-    found = link_motion(TREE, torch.from_numpy(lam), signals, base.torch())
+    found = link_motion(TREE, torch.from_numpy(lam), signals, FrameMotion.of(base.rows()))
     v, w, a, dw = (x[:, 1:].numpy() for x in found)
     return TreeData(TREE, q, dq, ddq, tau, base, BodyMotion(w, a, dw, v))
 
@@ -124,10 +124,10 @@ def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
             columns.append(inverse_dynamics(TREE, lam, theta, (q, still, ddq), base))
         return torch.stack(columns, dim=2)
 
-    base = data.base.torch()
+    base = FrameMotion.of(data.base.rows())
     for v in (base.v, torch.zeros_like(base.v)):
         moving = FrameMotion(v, base.w, base.a, base.dw)
-        tau = lagrange_torque(mass, *data.joint_signals(), moving).detach().numpy()
+        tau = lagrange_torque(mass, *map(torch.from_numpy, data.joints()), moving).detach().numpy()
         assert relative(tau, data.tau[:, 6:]) < 1e-9
 
 

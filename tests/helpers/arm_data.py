@@ -15,8 +15,9 @@ import pinocchio as pin
 from scipy.signal import butter, sosfilt
 
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Filtered, KnownArm, OnlineLearner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
+from adapter.learning.theta import Filtered, KnownArm
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.signals.front_end import FrontEnd

@@ -15,7 +15,7 @@ from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.learning.learner import OnlineLearner
 from adapter.physics.freedom import Freedom
-from adapter.realtime.session import LockstepResult, run_lockstep
+from adapter.realtime.session import Session, run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, frame_errors
 from adapter.runs.pipeline import make_front_end, make_learner
@@ -59,7 +59,7 @@ class FaultRun:
     driver: FaultyDriver
     front_end: FrontEnd
     learner: OnlineLearner
-    result: LockstepResult
+    result: Session
     finite: bool
     history: list[np.ndarray]
 

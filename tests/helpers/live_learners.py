@@ -18,10 +18,18 @@ import numpy as np
 
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.showing import View
-from adapter.realtime.snapshot import Snapshot, nothing_known
+from adapter.realtime.snapshot import Snapshot
 from adapter.signals.records import stamp_of
 
 DYING_AT = 300
+
+
+def nothing_known(n: int, bodies: int, effects: int) -> Snapshot:
+    """A snapshot of NaN for n joints, to be completed with `dataclasses.replace`."""
+    per_joint, per_body = np.full((n, 6), np.nan), np.full((bodies, 10), np.nan)
+    per_effect = np.full((effects, n), np.nan)
+    bodies_too = per_joint, per_joint, per_body, per_body
+    return Snapshot(*bodies_too, per_effect, per_effect, per_effect, np.full(n, np.nan))
 
 
 class Digest:

@@ -68,7 +68,7 @@ def with_load(mass: float, seed: int = 1) -> WithLoad:
 @pytest.mark.parametrize("mass", MASSES)
 def test_a_load_is_noticed_once_and_soon(mass: float) -> None:
     run = with_load(mass)
-    seen = [1e-9 * change.stamp_ns for change in run.learner.changes]
+    seen = [1e-9 * stamp_ns for stamp_ns in run.learner.changes]
     assert len(seen) == 1
     assert AT_S - 0.05 < seen[0] < AT_S + 0.3
 

@@ -17,11 +17,11 @@ from adapter.learning.batch.prediction_errors import (
     predicted_torques,
 )
 from adapter.learning.batch.schema import schema_from_moments
-from adapter.learning.batch.theta import BatchThetaSettings, learn_theta
+from adapter.learning.batch.theta import learn_theta
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.inertia import min_eigenvalue, theta_from_body
 from adapter.model.tree import Tree
-from adapter.physics.networks import link_motion
+from adapter.physics.networks import FrameMotion, link_motion
 from sim.falls.tree_truth import TreeTruth
 from tests.helpers.random_trees import random_tree
 from tests.helpers.torque_errors import torque_errors
@@ -66,7 +66,8 @@ def fall(
         answers[:, :, k] = predicted_torques(pushed, lam, theta)[:, :6] - wrench
     free = np.linalg.solve(answers, -wrench[..., None])[..., 0]
     data = replace(still, base=BodyMotion(w, free[:, :3], free[:, 3:], v))
-    k = link_motion(tree, torch.from_numpy(lam), data.joint_signals(), data.base.torch())
+    joints, base = tuple(map(torch.from_numpy, data.joints())), FrameMotion.of(data.base.rows())
+    k = link_motion(tree, torch.from_numpy(lam), joints, base)
     links = BodyMotion(*(x[:, 1:].numpy() for x in (k.w, k.a, k.dw, k.v)))
     return replace(data, links=links, tau=predicted_torques(data, lam, theta))
 
@@ -76,13 +77,12 @@ def test_a_base_is_not_driven_to_the_edge(how: dict[str, Any]) -> None:
     """Fitted alone to what the branches left open, it lost this tree's θ (median 0.06 and 1.0)."""
     truth = random_tree(5, 0)
     data, control = (fall(truth, 400, seed, **how) for seed in (0, 1))
-    for seed in range(3):
-        found = learn_theta(data, truth.lam, seed)
-        error = torque_errors(control, truth.lam, found.theta)
-        assert error.median < 1e-9 and error.p99 < 1e-6
-        assert found.converged and all(stage.converged for stage in found.stages)
-        assert found.min_eigenvalue > 0.0
-        assert sum(stage.steps for stage in found.stages) < 500
+    found = learn_theta(data, truth.lam)
+    error = torque_errors(control, truth.lam, found.theta)
+    assert error.median < 1e-9 and error.p99 < 1e-6
+    assert found.converged and all(stage.converged for stage in found.stages)
+    assert found.min_eigenvalue > 0.0
+    assert sum(stage.steps for stage in found.stages) < 500
 
 
 @pytest.mark.parametrize("seed", range(0, 8, 2))
@@ -90,19 +90,16 @@ def test_any_tree_from_few_samples(seed: int) -> None:
     truth = random_tree(5 + 2 * seed, 40 + seed)
     data, control = fall(truth, 120, seed), fall(truth, 100, seed + 100)
     lam = schema_from_moments(data).lam
-    found = learn_theta(data, lam, seed)
+    found = learn_theta(data, lam)
     error = torque_errors(control, lam, found.theta)
     assert found.converged and found.min_eigenvalue > 0.0
     assert error.median < 1e-6 and error.p99 < 1e-3
 
 
-def test_what_is_not_reached_is_said() -> None:
+def test_torques_of_nothing_leave_possible_bodies() -> None:
     truth = random_tree(5, 1)
     data = fall(truth, 100, 2)
-    slow = learn_theta(data, truth.lam, 0, BatchThetaSettings(solver="adam", adam_steps=20))
-    assert not slow.converged and slow.min_eigenvalue > 0.0
-    free = learn_theta(data, truth.lam, 0, BatchThetaSettings(solver="least squares"))
-    assert free.converged
+    assert learn_theta(data, truth.lam, possible=False).converged
     nothing = learn_theta(replace(data, tau=np.zeros_like(data.tau)), truth.lam)
     assert nothing.min_eigenvalue > 0.0 and np.isfinite(nothing.theta).all()
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from adapter.effects import effects_by_name
 from adapter.effects.by_joint import SMOOTHING_DQ, JointSignals
-from adapter.learning.settings import ThetaSettings
-from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Theta, ThetaKnowledge
+from adapter.learning.settings import LearnerSettings, ThetaSettings
+from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Filtered, KnownArm, Theta
 from adapter.learning.theta_kernels import body_from_log_cholesky, forget_along, pull_back
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.inertia import min_eigenvalue, pseudo_inertia
@@ -17,6 +16,7 @@ from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.kernels import base_at_rest
 from adapter.physics.networks import (
+    FrameMotion,
     regressor,
     theta_from_log_cholesky,
     theta_from_log_cholesky_torch,
@@ -72,7 +72,8 @@ class Case:
 
     def regressor(self) -> np.ndarray:
         """(m, rows, 10 bodies) by the torch network."""
-        signals, base = self.data.joint_signals(), self.data.base.torch()
+        base = FrameMotion.of(self.data.base.rows())
+        signals = tuple(map(torch.from_numpy, self.data.joints()))
         return regressor(self.tree, torch.from_numpy(self.lam), signals, base).numpy()
 
     def states(self, part: slice = slice(None)) -> np.ndarray:
@@ -92,9 +93,10 @@ def case(seed: int, floating: bool, rows: int = 61) -> Case:
 
 def make(of: Case, effects: tuple[str, ...] = EFFECTS, tool: np.ndarray | None = None, **settings):
     """θ of a tree; the hand is the last but one link, so that no place is taken by accident."""
-    base = base_at_rest(np.array([-0.1, 0.2, -9.8]))
-    known = ThetaKnowledge(base, GAIN, hand=of.tree.n - 2, tool_theta=tool)
-    theta = Theta(of.tree, known, effects_by_name(effects), ThetaSettings(**settings))
+    base = np.empty(0) if of.tree.floating else base_at_rest(np.array([-0.1, 0.2, -9.8]))
+    known = KnownArm(hand=of.tree.n - 2, tool_theta=tool)
+    how = LearnerSettings(effects=effects, theta=ThetaSettings(**settings))
+    theta = Theta(of.tree, base, how, Filtered(GAIN), known)
     theta.rests[:] = 1.0
     return theta
 

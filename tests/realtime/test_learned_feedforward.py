@@ -11,11 +11,12 @@ from adapter.control.limits import MotionLimits
 from adapter.model.robots import documented
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.session import run_lockstep
-from adapter.realtime.snapshot import SnapshotError, SnapshotWriter, nothing_known
+from adapter.realtime.snapshot import SnapshotError, SnapshotWriter
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
+from tests.helpers.live_learners import nothing_known
 
 PANDA = documented("panda")
 N = PANDA.tree.n

@@ -10,10 +10,11 @@ from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_quaternion, matrix_from_zxz, zxz_from_matrix
 from adapter.model.urdf import model_from_urdf
 from adapter.realtime.run_messages import RunMessages, ShownArm
-from adapter.realtime.snapshot import ExternalTorque, nothing_known
+from adapter.realtime.snapshot import ExternalTorque
 from drivers.files.estimates import EstimateNames
 from drivers.files.messages import decode
 from drivers.files.ros_types import TF
+from tests.helpers.live_learners import nothing_known
 
 URDF = """<robot name="bent"><link name="foot"/><link name="a"><inertial><mass value="1"/>
 <origin xyz="0 0 0.1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>

@@ -15,7 +15,8 @@ import pytest
 
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.realtime import SnapshotError, SnapshotReader, SnapshotWriter, snapshot
-from adapter.realtime.snapshot import PID, nothing_known
+from adapter.realtime.snapshot import PID
+from tests.helpers.live_learners import nothing_known
 
 JOINTS = ("a", "b", "c")
 

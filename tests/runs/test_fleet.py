@@ -19,7 +19,7 @@ from adapter.model import model_file
 from adapter.physics.identifiability import base_parameters
 from adapter.runs.config import PipelineSettings
 from adapter.runs.fleet import engine
-from adapter.runs.fleet.arm import FleetArm, Information, learn_arm
+from adapter.runs.fleet.arm import FleetArm, learn_arm
 from adapter.runs.fleet.engine import AT_HAND, here, on_cluster
 from adapter.runs.fleet.fleet import (
     Fleet,
@@ -164,16 +164,6 @@ def test_sums_are_those_of_one_pass(fleet: Fleet, logs: Path, tmp_path: Path) ->
     sure = ours.model.theta_std > 1e-6  # below that is what rounding leaves of a zero
     apart = np.abs(ours.model.theta - once.model.theta)[sure] / ours.model.theta_std[sure]
     assert np.max(apart) < 1e-5  # a conic solver has looked for possible bodies
-
-
-def test_information_is_the_learners() -> None:
-    theta = learner_of(panda_model()).theta
-    rng = np.random.default_rng(0)
-    A = rng.normal(size=theta.moments.A.shape)
-    theta.th[:] = 0.01 * rng.normal(size=theta.P)
-    theirs, ours = theta.data_information(A, theta.weights()), Information(theta)(A)
-    for a, b in zip(ours, theirs, strict=True):
-        assert np.allclose(a, b, rtol=1e-12, atol=1e-9 * np.abs(b).max())
 
 
 def test_neither_workers_nor_order_nor_parts_matter(

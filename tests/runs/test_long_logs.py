@@ -20,7 +20,6 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.replay import (
     Replay,
     ReplayOptions,
-    TickTimes,
     from_s,
     held_out_rms,
     last_s,
@@ -134,14 +133,3 @@ def test_recordings_one_after_the_other_in_a_file() -> None:
     ours, theirs = one_after_other([in_file(log), log]), one_after_other([log, log])
     assert ours.is_mapped and not theirs.is_mapped
     assert np.array_equal(ours.stamp_ns, theirs.stamp_ns) and np.array_equal(ours.q, theirs.q)
-
-
-def test_tick_times_in_bins() -> None:
-    rng, ticks = np.random.default_rng(1), TickTimes()
-    times = (1e4 * np.exp(rng.standard_normal(20_000))).astype(int)
-    for part in np.split(times, 10):
-        ticks.add(part)
-    for share in (50.0, 99.0, 99.9):
-        expected = float(np.percentile(times, share))
-        assert ticks.percentile_ns(share) == pytest.approx(expected, rel=0.02)
-    assert ticks.percentile_ns(100.0) == times.max() and ticks.count == len(times)

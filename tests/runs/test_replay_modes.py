@@ -66,7 +66,7 @@ def test_exact_replay_is_the_pipeline_sample_by_sample(links: bool) -> None:
     assert pipeline.front_end.refused == found.pipeline.front_end.refused
     assert passed == found.outcome.learned
     assert found.samples == len(data(links)) == found.ticks.count
-    assert 0 < found.ticks.percentile_ns(50.0) <= found.ticks.percentile_ns(100.0)
+    assert 0 < found.ticks.percentile_us(50.0) <= found.ticks.summary_us()["max"]
     assert found.span_s == pytest.approx(2.499)
 
 

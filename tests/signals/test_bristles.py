@@ -21,7 +21,8 @@ def moved() -> tuple[np.ndarray, np.ndarray]:
 def bent_along(t: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
     """(m, K, n) how far bristles are bent along a motion that begins with bristles at rest."""
     m, n = q.shape
-    bristles, bent = Bristles.unknown(n), np.empty((m, len(WAYS_RAD) * n))
+    nothing, held = np.zeros((2, n)), np.zeros((len(WAYS_RAD), n))
+    bristles, bent = Bristles(np.full(n, np.nan), *nothing, held), np.empty((m, held.size))
     for i, dt_s in enumerate(np.diff(t, prepend=t[0])):
         wind(dt_s, q[i], dq[i], bristles, bent[i])
     return bent.reshape(m, -1, n)

@@ -16,7 +16,7 @@ from adapter.experiments.baselines.learner import Baseline, Progress, Told
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import RANK_TOLERANCE
-from adapter.physics.networks import DTYPE, PER_BODY, regressor
+from adapter.physics.networks import DTYPE, PER_BODY, FrameMotion, regressor
 
 
 class RegressorLeastSquares(Baseline):
@@ -61,7 +61,9 @@ class RegressorLeastSquares(Baseline):
     def _rows(self, x: Array) -> Array:
         """Regressor of the joint torques, (m, n, 10 n); the carrier's own inertia is in none."""
         q, dq, ddq = (torch.from_numpy(np.ascontiguousarray(s)) for s in self.columns.joints(x))
-        full = regressor(self.tree, self.lam, (q, dq, ddq), self.columns.carrier(x).torch())
+        full = regressor(
+            self.tree, self.lam, (q, dq, ddq), FrameMotion.of(self.columns.carrier(x).rows())
+        )
         return full[:, 6:, PER_BODY:].numpy()
 
     def _answer(self, x: Array) -> Array:

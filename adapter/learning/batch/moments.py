@@ -15,7 +15,6 @@ from adapter.errors import ModelError
 from adapter.learning.schema_kernels import CHANNELS, WIDTH, accumulate, signals
 from adapter.learning.tree_data import TreeData, check_motion
 from adapter.model.spatial import Array
-from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, jit
 
 # Which of the parent's signals stand in s, three numbers each; products of w_i come last in a's.
@@ -23,36 +22,15 @@ _PARENT_SIGNALS = (("w",), ("v", "w"), ("a", "dw"), ("dw",))
 
 
 @dataclass(frozen=True)
-class LinkNoise:
-    """Standard deviation of one sample of a link's motion, as it stands in the data.
-
-    Attributes:
-        w: rad/s; v: m/s; a: m/s²; dw: rad/s².
-    """
-
-    w: float
-    v: float
-    a: float
-    dw: float
-
-    def __post_init__(self) -> None:
-        for name in CHANNELS:
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ModelError(f"noise of {name} must be 0 or more, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
 class SchemaMoments:
     """Sums over samples of [y, s] [y, s]^T, by joint and channel.
 
     Attributes:
-        tree: N and A.
         sums: (n, 4, 15, 15), channels in the order of `CHANNELS`.
         count: number of samples.
         with_speed: whether velocities v were measured (else their channel is zero).
     """
 
-    tree: Tree
     sums: Array
     count: int
     with_speed: bool
@@ -61,24 +39,22 @@ class SchemaMoments:
         """Sum of |y|² (n, 4)."""
         return np.asarray(np.trace(self.sums[:, :, :3, :3], axis1=2, axis2=3))
 
-    def without_noise(self, variance: Array) -> Array:
-        """`sums` with the noise power of the parents' signals taken out.
+    def without_noise(self, j: int, variance: Array) -> Array:
+        """`sums` of joint j (4, 15, 15) with the noise power of the parent's signals taken out.
 
         Noise in what a fit takes as input passes for excitation and shrinks what is found
         (errors in variables); its expected power is known once its variance is.
 
         Args:
-            variance: (n, 4) of the parent's w, v, a, dw by joint.
+            variance: (4,) of the parent's w, v, a, dw.
         """
-        out = self.sums.copy()
+        out = self.sums[j].copy()
         for channel, names in enumerate(_PARENT_SIGNALS):
             if channel == CHANNELS.index("v") and not self.with_speed:
                 continue
             for block, name in enumerate(names):
                 place = 3 + 3 * block + np.arange(3)
-                out[:, channel, place, place] -= (
-                    self.count * variance[:, CHANNELS.index(name)][:, None]
-                )
+                out[channel, place, place] -= self.count * variance[CHANNELS.index(name)]
         return out
 
 
@@ -100,7 +76,7 @@ def schema_moments(data: TreeData) -> SchemaMoments:
     _accumulate(parent, JointMotion(data.q, data.dq, data.ddq), base, links, sums)
     if not with_speed:
         sums[:, CHANNELS.index("v")] = 0.0
-    return SchemaMoments(data.tree, sums, len(data), with_speed)
+    return SchemaMoments(sums, len(data), with_speed)
 
 
 @jit

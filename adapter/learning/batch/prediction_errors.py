@@ -15,8 +15,7 @@ from adapter.learning.tree_data import (
     check_motion,
 )
 from adapter.model.spatial import Array
-from adapter.physics.kernels import JointMotion, frames_of, link_motions, torques
-from adapter.physics.networks import PER_BODY
+from adapter.physics.kernels import frames_of, link_motions, torques
 
 CHUNK = 4096  # samples propagated at a time: 30 links' motion then takes 12 MB
 # Edges of the histogram: decades of |k - k_hat| from rounding to gross.
@@ -64,7 +63,7 @@ def kinematic_errors(data: TreeData, lam: Array) -> KinematicErrors:
     for start in range(0, len(data), CHUNK):
         part = data.take(slice(start, start + CHUNK))
         found = np.empty((*part.q.shape, 12))
-        link_motions(frames, _joints(part), part.base.rows(), found)
+        link_motions(frames, part.joints(), part.base.rows(), found)
         for name in channels:
             gap = np.abs(found[:, :, _PLACES[name]] - getattr(part.links, name))
             worst[name] = np.maximum(worst[name], gap.max(axis=(0, 2)))
@@ -79,19 +78,15 @@ def predicted_torques(data: TreeData, lam: Array, theta: Array) -> Array:
     Raises:
         ModelError: λ or θ of another shape, or numbers that are not finite.
     """
-    wanted = (data.tree.n, 6), (data.tree.bodies, PER_BODY)
+    wanted = (data.tree.n, 6), (data.tree.bodies, 10)
     if (lam.shape, theta.shape) != wanted:
         raise ModelError(f"λ and θ must have shapes {wanted}, got {lam.shape} and {theta.shape}")
     check_dynamics(data)
     check_finite({"λ": lam, "θ": theta})
     tau = np.empty(data.tau.shape)
     frames = frames_of(data.tree.parent, lam)
-    torques(frames, np.ascontiguousarray(theta), _joints(data), data.base.rows(), tau)
+    torques(frames, np.ascontiguousarray(theta), data.joints(), data.base.rows(), tau)
     return tau
-
-
-def _joints(data: TreeData) -> JointMotion:
-    return JointMotion(*(np.ascontiguousarray(x) for x in (data.q, data.dq, data.ddq)))
 
 
 def relative_errors(tau: Array, estimate: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Solvers of R θ = b: least squares in base parameters, and two over bodies that can exist.
+"""Solvers of R θ = b: least squares in base parameters, and over bodies that can exist.
 
 A body can exist where its pseudo-inertia (4, 4), linear in θ, is positive definite (Wensing, Kim
 and Slotine 2018). Least squares over such bodies is a semidefinite program (Clarabel solves it):
@@ -13,23 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import torch
 
 from adapter.errors import ModelError
 from adapter.learning.batch.conic import LENGTH, cones, entries, nonnegative, solve_conic
 from adapter.model.inertia import min_eigenvalue, pseudo_inertia
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import RANK_TOLERANCE
-from adapter.physics.networks import (
-    PER_BODY,
-    theta_from_log_cholesky,
-    theta_from_log_cholesky_torch,
-)
-
-# Random bodies to start from: masses (kg), distance of the centre and radii of gyration (m).
-START_MASS, START_REACH, START_RADIUS, START_SPREAD = (0.5, 10.0), 0.1, 0.1, 0.3
-GAP, NEGLIGIBLE = 1e-7, 1e-14
-RATE, LAST_RATE, BETAS = 1e-2, 1e-4, (0.97, 0.99)  # of ADAM
 
 EDGE = 1e-6  # kg, least eigenvalue in those units of a body that noise pushes to the edge
 ROOM = 1e-2  # kg, such an eigenvalue from which on more room is worth nothing
@@ -45,15 +34,14 @@ class Solution:
         theta: (bodies, 10).
         cost: half the weighted sum of squares that is left.
         steps: taken.
-        rank: directions of θ that the rows show; None where the solver does not ask.
-        converged: whether the cost is the least that such bodies allow, but for `GAP` of it or
-            `NEGLIGIBLE` of the signal.
+        rank: directions of θ that the rows show.
+        converged: whether the cost is the least that such bodies allow.
     """
 
     theta: Array
     cost: float
     steps: int
-    rank: int | None = None
+    rank: int
     converged: bool = True
 
 
@@ -80,7 +68,7 @@ def consistent_theta(r: Array, b: Array) -> Solution:
     scale, u, values, vt = _decomposed(r)
     shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
     hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
-    theta, steps, solved = _roomiest(shown.reshape(-1, PER_BODY), hidden)
+    theta, steps, solved = _roomiest(shown.reshape(-1, 10), hidden)
     if not solved:  # least is left by possible bodies, what does not show near a small one
         theta, more, solved = _closest(r, b)
         steps += more
@@ -105,7 +93,7 @@ def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
 
 
 _UNITS = np.diag([1.0 / LENGTH] * 3 + [1.0])
-_FROM_THETA = entries(_UNITS @ pseudo_inertia(np.eye(PER_BODY)) @ _UNITS).T  # entries of one body
+_FROM_THETA = entries(_UNITS @ pseudo_inertia(np.eye(10)) @ _UNITS).T  # entries of one body
 _TO_THETA = np.linalg.inv(_FROM_THETA)
 _ONE = entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
 
@@ -121,8 +109,8 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
     """
     bodies, count = len(shown), hidden.shape[1]
     fixed = (shown @ _FROM_THETA.T).ravel()
-    moved = np.einsum("ek,bkh->beh", _FROM_THETA, hidden.reshape(bodies, PER_BODY, count))
-    free = np.linalg.qr(moved.reshape(PER_BODY * bodies, count))[0]
+    moved = np.einsum("ek,bkh->beh", _FROM_THETA, hidden.reshape(bodies, 10, count))
+    free = np.linalg.qr(moved.reshape(10 * bodies, count))[0]
     one = np.tile(_ONE, bodies)
     size = max(float(np.abs(fixed).max()), 1e-300)
     goal = np.append(LIGHT * (free.T @ one), -1.0)
@@ -138,14 +126,14 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
     )
     if not np.isfinite(x).all():
         return shown, steps, False
-    theta = (fixed + size * (free @ x[:count])).reshape(bodies, PER_BODY) @ _TO_THETA.T
+    theta = (fixed + size * (free @ x[:count])).reshape(bodies, 10) @ _TO_THETA.T
     return theta, steps, bool(min_eigenvalue(theta).min() > 0.0)
 
 
 def _closest(r: Array, b: Array) -> tuple[Array, int, bool]:
     """Least squares with every eigenvalue at least `EDGE`: θ, steps, and whether it is the best."""
-    bodies = r.shape[1] // PER_BODY
-    table = np.einsum("kbe,ef->kbf", r.reshape(len(r), bodies, PER_BODY), _TO_THETA)
+    bodies = r.shape[1] // 10
+    table = np.einsum("kbe,ef->kbf", r.reshape(len(r), bodies, 10), _TO_THETA)
     table = table.reshape(len(r), -1)
     power = float(b @ b) or 1.0
     quadratic, goal = table.T @ table / power, -(table.T @ b) / power
@@ -160,45 +148,11 @@ def _closest(r: Array, b: Array) -> tuple[Array, int, bool]:
     )
     if not np.isfinite(x).all():
         raise ModelError("no possible bodies were found near what the data say; are they sound?")
-    theta = x.reshape(bodies, PER_BODY) @ _TO_THETA.T
+    theta = x.reshape(bodies, 10) @ _TO_THETA.T
     least = np.linalg.eigvalsh(_UNITS @ pseudo_inertia(theta) @ _UNITS).min(axis=-1)
     # where the solver stopped short of the edge's right side
     lifted = np.maximum(EDGE - least, 0.0)[:, None] * (_ONE @ _TO_THETA.T)
     return theta + lifted, steps, solved
-
-
-def adam_theta(r: Array, b: Array, start: Array, steps: int = 5000) -> Solution:
-    """ADAM on the moments R^T R over possible bodies, as the online learner descends them.
-
-    Any log-Cholesky vector is a possible body, so no constraint is needed.
-
-    Args:
-        start: (bodies, 10) log-Cholesky vectors.
-    """
-    x = torch.from_numpy(start.copy()).requires_grad_()
-    power = float(b @ b) or 1.0
-    factor, right = (torch.from_numpy(np.ascontiguousarray(a / np.sqrt(power))) for a in (r, b))
-    moments, cross = factor.T @ factor, factor.T @ right
-    optimiser = torch.optim.Adam([x], lr=RATE, betas=BETAS, eps=1e-14)
-    for step in range(steps):
-        optimiser.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (step / steps)
-        optimiser.zero_grad()
-        theta = theta_from_log_cholesky_torch(x).ravel()
-        (0.5 * theta @ (moments @ theta) - cross @ theta).backward()
-        optimiser.step()
-    found = theta_from_log_cholesky(x.detach().numpy())
-    cost, least = _cost(r, b, found), consistent_theta(r, b).cost
-    close = cost - least <= max(GAP * least, NEGLIGIBLE * 0.5 * power)
-    return Solution(found, cost, steps, converged=close)
-
-
-def random_bodies(count: int, rng: np.random.Generator) -> Array:
-    """Log-Cholesky vectors (count, 10) of random possible bodies."""
-    mass = np.exp(rng.uniform(np.log(START_MASS[0]), np.log(START_MASS[1]), count))
-    radii = np.log(START_RADIUS) + START_SPREAD * rng.normal(size=(count, 3))
-    sides = START_RADIUS * START_SPREAD * rng.normal(size=(count, 3))
-    centre = START_REACH * rng.normal(size=(count, 3))
-    return np.concatenate([0.5 * np.log(mass)[:, None], radii, sides, centre], axis=1)
 
 
 def _cost(r: Array, b: Array, theta: Array) -> float:

@@ -13,7 +13,6 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
 from scipy.stats import chi2
 
 from adapter.learning.learner import OnlineLearner
@@ -93,41 +92,6 @@ class FleetArm:
     logs: tuple[OfLog, ...]
     drifts: tuple[Drift, ...]
     standing_out: tuple[StandsOut, ...]
-
-
-class Information:
-    """What moments tell of (θ, effects): one linear map for recordings by the thousand.
-
-    Information of the joints' torques, with the weights and shapes of effects as they are now.
-
-    `Theta.data_information` for one set of moments after the other: what it looks up is looked up
-    once here, which makes it a hundred times faster.
-
-    Args:
-        theta: whose parameters and weights these are.
-    """
-
-    def __init__(self, theta: Theta) -> None:
-        self._width = theta.P + 1  # the torque is the last column
-        at, weights = theta.rows, theta.weights()
-        parts = []
-        for j, size in enumerate(at.sizes):
-            place, share = np.r_[at.place[j, :size], theta.P], np.r_[at.share[j, :size], 1.0]
-            first, second = np.triu_indices(size + 1)
-            value = weights[j] * share[first] * share[second]
-            number = at.starts[j] + np.arange(len(first))
-            mirrored = first != second
-            for a, b, use in ((first, second, slice(None)), (second, first, mirrored)):
-                to = place[a] * self._width + place[b]
-                parts.append((value[use], to[use], number[use]))
-        value, to, number = (np.concatenate(x) for x in zip(*parts, strict=True))
-        shape = self._width**2, len(theta.moments.A)
-        self._map: csr_array = coo_array((value, (to, number)), shape=shape).tocsr()
-
-    def __call__(self, A: Array) -> tuple[Array, Array]:
-        """Information (P, P) and right side (P,) of moments A, see `Moments`."""
-        whole = np.asarray(self._map @ A).reshape(self._width, self._width)
-        return whole[:-1, :-1], whole[:-1, -1]
 
 
 def learn_arm(
@@ -227,14 +191,13 @@ def _without(theta: Theta, A: Array, load: Array | None) -> Array:
 
 def _loads(theta: Theta, found: Sequence[LogMoments]) -> dict[str, tuple[Array, float]]:
     """Bodies (10,) beside the usual hand, and the standard deviations of their masses."""
-    information = Information(theta)
-    every = _solved(theta, information, found, range(len(found)))
+    every = _solved(theta, found, range(len(found)))
     masses = np.array([x.body[0] for x in every])
     usual = every[np.argsort(masses)[len(masses) // 2]]
     std = np.array([_mass_std(theta, x, usual) for x in every])
     beyond = np.abs(masses - usual.body[0]) > np.maximum(LEAST_LOAD_KG, LOAD_STD * std)
     loaded = [k for k, x in enumerate(beyond) if x]
-    again = _solved(theta, information, found, loaded)
+    again = _solved(theta, found, loaded)
     return {
         found[k].content: (x.body, _mass_std(theta, x, None))
         for k, x in zip(loaded, again, strict=True)
@@ -269,19 +232,17 @@ def _mass_std(theta: Theta, ours: Body, other: Body | None) -> float:
     return float(np.sqrt(variance + follows @ ours.arm @ follows))
 
 
-def _solved(
-    theta: Theta, information: Information, found: Sequence[LogMoments], loaded: Sequence[int]
-) -> list[Body]:
+def _solved(theta: Theta, found: Sequence[LogMoments], loaded: Sequence[int]) -> list[Body]:
     """Bodies at the hands of `loaded`, the arm's θ being common.
 
     A body acts as the hand does; it is eliminated from the information of its recording, and found
     when all others have said what the arm is (Schur complement).
     """
-    hand = theta.hand
-    H, rhs = information(reduce(np.add, (x.A for x in found)))
+    hand, weights = theta.hand, theta.weights()
+    H, rhs = theta.data_information(reduce(np.add, (x.A for x in found)), weights)
     H, rhs = H + theta.prior, rhs + theta.prior_rhs
     for k in loaded:
-        own, side = information(found[k].A)
+        own, side = theta.data_information(found[k].A, weights)
         gain = _gain(own, hand)
         H -= own[:, hand] @ gain
         rhs -= gain.T @ side[hand]
@@ -291,7 +252,7 @@ def _solved(
     common[known] = inverse @ rhs[known]
     bodies = []
     for k in loaded:
-        own, side = information(found[k].A)
+        own, side = theta.data_information(found[k].A, weights)
         alone = np.asarray(
             np.linalg.inv(own[hand, hand] + np.diag(1.0 / PRIOR_STD**2)), dtype=float
         )
@@ -316,11 +277,11 @@ def _of_logs(
     H, _ = theta.information()
     known = theta.known()
     before = np.linalg.slogdet(H[np.ix_(known, known)])[1]
-    of, told = Information(theta), []
+    weights, told = theta.weights(), []
     for log in found:
         load = loads.get(log.content)
         A = _without(theta, log.A, None if load is None else load[0])
-        information, side = of(A)
+        information, side = theta.data_information(A, weights)
         best = theta.th.copy()
         alone = (information + theta.prior)[np.ix_(known, known)]
         best[known] = np.linalg.solve(alone, (side + theta.prior_rhs)[known])
