@@ -232,11 +232,12 @@ def decode_many(
 
 
 def _same_layout(rows: Rows, sample: NDArray[np.uint8], layout: Layout) -> NDArray[np.bool_]:
-    same = (rows[:, : _STAMP.start] == sample[: _STAMP.start]).all(axis=1)
-    start = _STAMP.stop
-    for run in layout.varying or layout.doubles:
+    same, start = np.ones(len(rows), dtype=np.bool_), 0
+    for run in (_STAMP, *(layout.varying or layout.doubles)):
         assert isinstance(run, slice)
-        same &= (rows[:, start : run.start] == sample[start : run.start]).all(axis=1)
+        fixed = rows[:, start : run.start] == sample[start : run.start]
+        if not fixed.all():  # all at once is four times as fast as row by row
+            same &= fixed.all(axis=1)
         start = run.stop
     return same
 

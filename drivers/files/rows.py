@@ -41,15 +41,16 @@ class RowsFile:
         if table.shape[1:] != (self.width,):
             raise ValueError(f"rows of {self.width} numbers, got {table.shape[1:]}")
         self._file.seek(8 * self.width * self._count)
-        self._file.write(np.ascontiguousarray(table, dtype=self._dtype).tobytes())
+        self._file.write(np.ascontiguousarray(table, dtype=self._dtype).data)
         self._count += len(table)
 
     def rows(self, start: int, stop: int) -> NDArray[Any]:
         """Rows `start` to `stop` (not included), as far as there are such; a copy, bit by bit."""
         start, stop = min(start, self._count), min(stop, self._count)
+        out = np.empty((max(stop - start, 0), self.width), self._dtype)
         self._file.seek(8 * self.width * start)
-        content = bytearray(self._file.read(8 * self.width * max(stop - start, 0)))
-        return np.frombuffer(content, dtype=self._dtype).reshape(-1, self.width)
+        self._file.readinto(out.data)
+        return out
 
     def stretches(self) -> Iterator[NDArray[Any]]:
         """All rows, so many at a time."""

@@ -14,6 +14,7 @@ import importlib
 import mmap
 import struct
 import zlib
+from array import array
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -153,8 +154,8 @@ class Walk:
         end: where it stopped; full: because there were as many messages as were asked for.
     """
 
-    start: list[int] = field(default_factory=list)
-    stop: list[int] = field(default_factory=list)
+    start: array[int] = field(default_factory=lambda: array("q"))
+    stop: array[int] = field(default_factory=lambda: array("q"))
     others: list[tuple[int, int, int]] = field(default_factory=list)  # opcode, first, last byte
     end: int = 0
     full: bool = False
@@ -214,11 +215,11 @@ def _note_repeated(found: Walk, data: memoryview, at: int, most: int | None) -> 
     head = (heads[:, None] + np.arange(HEAD)).ravel()
     rows = np.frombuffer(data, np.uint8, times * width, at).reshape(times, width)
     last = np.frombuffer(data, np.uint8, width, at - width)
-    same = (rows[:, head] == last[head]).all(axis=1)
-    times = times if same.all() else int(np.argmin(same))
+    same = rows[:, head] == last[head]
+    times = times if same.all() else int(np.argmin(same.all(axis=1)))
     places = at + heads + width * np.arange(times)[:, None]
-    found.start += (places + (HEAD + _MESSAGE_HEAD)).ravel().tolist()
-    found.stop += (places + sizes[-turn:]).ravel().tolist()
+    found.start.frombytes((places + (HEAD + _MESSAGE_HEAD)).tobytes())
+    found.stop.frombytes((places + sizes[-turn:]).tobytes())
     return at + times * width
 
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from mcap.records import Channel
@@ -106,10 +107,9 @@ class Series:
 def in_order(blocks: Sequence[Block], of: Callable[[Block], NDArray]) -> NDArray:
     """What each block has of its messages, in one array in the order of the file."""
     joined = np.concatenate([of(block) for block in blocks])
-    places = np.concatenate([block.index for block in blocks])
-    if np.all(places[1:] > places[:-1]):
+    if all(a.index[-1] < b.index[0] for a, b in pairwise(blocks)):
         return joined
-    return joined[np.argsort(places, kind="stable")]
+    return joined[np.argsort(np.concatenate([block.index for block in blocks]), kind="stable")]
 
 
 def schema_name(scan: Scan, channel: Channel) -> str:
