@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(args.truth, robot)
     logs = [_joined(args, whole, robot)]
     logs += [matching(read_log(path, topic=args.topic), robot) for path in more]
-    logs, gains = _as_told(args, logs, robot)
+    logs, robot, gains = _as_told(args, logs, robot)
     log = replay.one_after_other(logs) if more else logs[0]
     imus: tuple[str, ...] = ()
     if args.base is None:
@@ -122,8 +122,8 @@ def _figures(
 
 def _as_told(
     args: argparse.Namespace, logs: list[Log], robot: SelfModel
-) -> tuple[list[Log], TorqueGains | None]:
-    """Recordings as the robot means them, and the gains where they were learned.
+) -> tuple[list[Log], SelfModel, TorqueGains | None]:
+    """Recordings as the robot means them, how it stands, and the gains where they were learned.
 
     Raises:
         RecordingRefused: joints or efforts are not the robot's, and nobody says how they are told.
@@ -141,9 +141,9 @@ def _as_told(
         logs[0].warnings.extend([*gains.notes, *gains.words()])
     if not robot.tree.floating:
         for k, log in enumerate(logs):
-            logs[k], said = check_torque(log, robot)
+            logs[k], robot, said = check_torque(log, robot)
             logs[0].warnings.extend(said)
-    return logs, gains
+    return logs, robot, gains
 
 
 def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:

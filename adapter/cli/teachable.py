@@ -22,7 +22,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         locked.append(f"predicted for {len(log)} of its {len(whole)} samples, where it moves most")
     unit, teaches = "N m", "yes"
     try:
-        log, doubt = check_torque(log, robot)
+        log, robot, doubt = check_torque(log, robot)
     except RecordingRefused as refusal:
         unit, doubt, teaches = str(refusal), [str(refusal)], "no"
     told = teachable(log, robot)

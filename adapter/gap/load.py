@@ -170,7 +170,7 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
         more = dead + torque.notes
     alive, notes = np.ptp(own.tau, axis=0) > 0.0, own.warnings + said + more
     own = torque.in_time(own if survey is None else survey.log)
-    moments = _of_all(own, model)
+    moments = _of_all(own, torque.mounted(model))
     left_s = float(moments.rows.sum()) * moments.period_s
     if left_s < LEAST_S:
         raise RecordingRefused(

@@ -190,7 +190,8 @@ def learn(
 
     Args:
         log: a file, of any length, or what `read_log` or `make_log` returned.
-        model: the documented arm; the learner gets its topology, gravity, tool and limits.
+        model: the documented arm; the learner gets its topology, gravity (or the torques', where
+            the base clearly stands askew), tool and limits.
         effects: names learned beside θ, () for none; those of a real arm where None.
         every: samples per update; 1 is what the live process does, up to 50 is faster.
         validate_from_s: learn before this time (s after the first sample), score on the rest;
@@ -213,7 +214,7 @@ def learn(
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
         raise SettingsError(f"validation from {split_s} s is outside 0 to {end_s:.1f} s")
-    own, said = check_torque(own, arm)
+    own, arm, said = check_torque(own, arm)
     for note in said:
         warnings.warn(note, ModelWarning, stacklevel=2)
     filter_settings, _ = fitted_to(own, PipelineSettings().filter)

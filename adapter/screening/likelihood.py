@@ -26,6 +26,7 @@ FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # where the search for the noise begins: N m,
 INERTIA_SHARE, RADIUS_M = 0.4, 0.1  # plausible error of masses; of where they sit
 LOAD_STD = np.repeat((3.0, 0.3, 0.05), (1, 3, 6))  # kg, kg m, kg m2
 FRICTION = (1.0, 4.0, 4.0, 0.1)  # std of offset, Coulomb, viscous (N m, N m, N m s/rad), gain
+TILT_STD_RAD = np.deg2rad(5.0)  # of a base: what stands on a wall is read as such
 SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque went through
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
@@ -75,7 +76,7 @@ class Explained(NamedTuple):
         cost: twice the negative log-likelihood.
         share, size: of each joint's torque the share (n,) of its variance that is explained, and
             its size (n,) as a multiple of the model's.
-        x: (10 n + 4 n,) corrections, in standard deviations.
+        x: (10 n + 4 n,) corrections, in standard deviations, and what else was asked for.
     """
 
     cost: float
@@ -132,9 +133,26 @@ class Telling:
         """
         return self.explaining(rows, changed)(rows.tau)
 
-    def explaining(self, rows: Rows, changed: int | None = None) -> Callable[[Array], Explained]:
-        """The same of any torques (m, n) of these instants."""
+    def askew(self, rows: Rows) -> tuple[Explained, Array]:
+        """How well rows are explained on a base that stands askew, and gravity (3,) in its axes."""
+        arm, still = self.arm, np.zeros_like(rows.q)
+        size = float(np.linalg.norm(arm.gravity))
+        aside = size * TILT_STD_RAD * np.linalg.svd(arm.gravity[None])[2][1:]
+        bodies = arm.theta
+        for _ in range(2):  # what the hand holds is askew as well
+            tilts = [arm.changed(bodies, x).torque(rows.q, still, still) for x in aside]
+            found = self.explaining(rows, more=np.stack(tilts, axis=2))(rows.tau)
+            bodies = arm.theta + inertial_std(arm) * found.x[: bodies.size].reshape(bodies.shape)
+        gravity = arm.gravity + found.x[-2:] @ aside
+        return found, gravity * (size / np.linalg.norm(gravity))
+
+    def explaining(
+        self, rows: Rows, changed: int | None = None, more: Array | None = None
+    ) -> Callable[[Array], Explained]:
+        """The same of any torques (m, n) of these instants, by columns `more` (m, n, k) too."""
         columns, model = self._columns(rows, changed)
+        if more is not None:
+            columns = np.concatenate([columns, more], axis=2)
         (m, n), beyond = model.shape, self._beyond(rows.q)
         counts = np.where(np.abs(rows.dq) < SMOOTHING_DQ, REST, 1.0)  # as roots of weights
         counts /= np.sqrt(np.mean(np.square(counts), axis=0))
@@ -160,7 +178,7 @@ class Telling:
             honest = left / np.maximum(1.0 - used / self.samples, 1.0 / self.samples)
             share = 1.0 - honest / np.maximum(tau.var(axis=0), floor**2)
             size = 1.0 + FRICTION[-1] * x[gains]
-            return Explained(cost + beyond, share, size, x[: gains.stop])
+            return Explained(cost + beyond, share, size, x)
 
         return of
 
@@ -171,7 +189,7 @@ class Telling:
     def corrected(self, x: Array, rows: Rows) -> Array:
         """(m, n) N m of the model with corrections x, see `Explained`; `rows.tau` is not used."""
         n, model = self.arm.n, self.torque(rows)
-        own = x[10 * n :].reshape(len(FRICTION), n) * np.array(FRICTION)[:, None]
+        own = x[10 * n : 14 * n].reshape(len(FRICTION), n) * np.array(FRICTION)[:, None]
         bodies = self.arm.changed(inertial_std(self.arm) * x[: 10 * n].reshape(n, 10))
         step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
         friction = own[0] + own[1] * step + own[2] * rows.dq + own[3] * model

@@ -225,7 +225,7 @@ class Readings:
         apart = (rows.tau - self.model + own) * weight
         found = np.asarray(np.linalg.lstsq(columns, apart.ravel(), rcond=None)[0], dtype=float)
         size = float(np.linalg.norm(found))
-        if not size or _angle(found, arm.gravity) < TILT_RAD:
+        if not size or angle(found, arm.gravity) < TILT_RAD:
             return
         gravity = found * (G / size)
         told = ", ".join(f"{x:.1f}" for x in gravity)
@@ -362,7 +362,8 @@ def _divided(rows: Rows, factor: Array) -> Rows:
     return rows._replace(tau=rows.tau / factor, scaled=rows.scaled + more)
 
 
-def _angle(a: Array, b: Array) -> float:
+def angle(a: Array, b: Array) -> float:
+    """Between two vectors, rad."""
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(np.arccos(np.clip(a @ b / size, -1.0, 1.0))) if size else 0.0
 

@@ -12,8 +12,15 @@ from numpy.typing import NDArray
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.screening.likelihood import ROWS, Rows, Telling, explains_nothing, lateness_s
-from adapter.screening.readings import other_hand, otherwise_told
+from adapter.screening.likelihood import (
+    EVIDENCE,
+    ROWS,
+    Rows,
+    Telling,
+    explains_nothing,
+    lateness_s,
+)
+from adapter.screening.readings import angle, other_hand, otherwise_told
 from adapter.screening.rows import pauses, stuck
 from adapter.screening.timing import (
     RecordingClock,
@@ -40,6 +47,7 @@ BEYOND_RAD, BEYOND_SHARE = 0.2, 0.05  # over the limit, and in which share of th
 EVERY = 40  # ms at least between the rows that are judged
 FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
 PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
+LEAST_TILT_RAD = np.deg2rad(1.0)  # of a base: so well a table is level
 NAMED_LATE_S = 0.02  # of torques: what is less a bus and a filter make, which `gap` names
 DDQ_S = 0.02  # either side of an instant, over which velocities tell accelerations
 EDGE = 300  # ms at either end, where the filter has no neighbours
@@ -93,18 +101,28 @@ class Judged:
         late_s: how much later than the motion they come.
         model: of them, after corrections of a plausible size, by instants; None where unknown.
         doubts: what speaks against a recording that is trusted.
+        gravity: (3,) m/s² in the base's axes, where it stands askew; else None.
     """
 
     late_s: float = 0.0
     model: Callable[[Rows], Array] | None = None
     doubts: tuple[str, ...] = ()
+    gravity: Array | None = None
 
     @property
     def notes(self) -> list[str]:
         """What to know of them, a sentence each."""
         side = "after" if self.late_s > 0.0 else "before"
         late = f"The torques come {1e3 * abs(self.late_s):.0f} ms {side} the motion."
-        return [*self.doubts, *([late] if self.late_s else [])]
+        said = [*self.doubts, *([late] if self.late_s else [])]
+        if self.gravity is not None:
+            along = " ".join(f"{x:.4g}" for x in self.gravity)
+            said.append(f"The base stands askew, by its torques: --gravity {along} says so.")
+        return said
+
+    def mounted(self, model: SelfModel) -> SelfModel:
+        """The arm as its base stands."""
+        return model if self.gravity is None else replace(model, gravity=self.gravity)
 
     def in_time(self, log: Log) -> Log:
         """A recording with torques at their own instants, without samples that have none then."""
@@ -185,8 +203,8 @@ def refuse(log: Log, model: SelfModel) -> Screened:
     dead = silent(log, names)
     torque = judged(log, model, (q, dq, ddq, tau), recorded if renamed else ())
     said = standing(names, moving, q, dq)
-    if abs(torque.late_s) < NAMED_LATE_S:
-        torque = replace(torque, late_s=0.0)
+    late_s = torque.late_s if abs(torque.late_s) >= NAMED_LATE_S else 0.0
+    torque = replace(torque, late_s=late_s, gravity=None)  # `gap` names a tilt, with its doubt
     return Screened(log, timing, moving, outside, said, dead + torque.notes, torque)
 
 
@@ -449,7 +467,12 @@ def _judged(
             RecordingFault(found[0].kind),
             f"{log.path}: {said}; the model explains the torques then and not as recorded.",
         )
-    return Judged(late_s, partial(telling.corrected, now.x))
+    passed = Judged(late_s, partial(telling.corrected, now.x))
+    if model.gravity.any():
+        askew, gravity = telling.askew(rows)
+        if askew.cost < now.cost - EVIDENCE and angle(gravity, model.gravity) > LEAST_TILT_RAD:
+            return replace(passed, gravity=gravity)
+    return passed
 
 
 def judged_rows(
@@ -509,11 +532,13 @@ def torque_verdict(log: Log, model: SelfModel) -> tuple[Judged | None, list[str]
     return torque, [*said, *torque.notes]
 
 
-def check_torque(log: Log, model: SelfModel) -> tuple[Log, list[str]]:
-    """A recording as it is learned from, and notes on it; see `torque_verdict`.
+def check_torque(log: Log, model: SelfModel) -> tuple[Log, SelfModel, list[str]]:
+    """A recording as it is learned from, the arm as it stands, and notes; see `torque_verdict`.
 
     Torques are in time, and the model's where none were measured. Where too little moves to tell,
     it is as it was.
     """
     torque, said = torque_verdict(log, model)
-    return (log if torque is None else torque.whole(torque.in_time(log))), said
+    if torque is None:
+        return log, model, said
+    return torque.whole(torque.in_time(log)), torque.mounted(model), said

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
@@ -58,8 +59,9 @@ def by_load(log: adapter.Log, model: SelfModel) -> Numbers:
 
 
 def by_learn(log: adapter.Log, model: SelfModel) -> Numbers:
-    """Torques of a model that was learned, at some poses in motion."""
+    """Torques of a model that was learned, at some poses in motion, on a base that is level."""
     learned, rng = adapter.learn(log, model, every=EVERY).model, np.random.default_rng(0)
+    learned = replace(learned, gravity=model.gravity)
     q = rng.uniform(model.limits.lower, model.limits.upper, (50, len(model.limits.lower)))
     tau = adapter.inverse_dynamics(learned, q, rng.uniform(-0.5, 0.5, q.shape), 0.0 * q)
     off = TORQUE_NM / STDS / np.sqrt(2.0)

@@ -146,10 +146,20 @@ def test_ten_milliseconds_late_are_a_delay_and_no_low_pass() -> None:
 
 @pytest.mark.parametrize("name", [*UNHEARD, "bursts of zeros"])
 def test_who_learns_is_given_torques_of_the_arm_alone(name: str) -> None:
-    log, _ = check_torque(ODD[name](), panda_model())
+    log, _, _ = check_torque(ODD[name](), panda_model())
     _, ours, theirs = np.intersect1d(log.stamp_ns, base().stamp_ns, return_indices=True)
     off = np.sqrt(np.mean((log.tau[ours] - base().tau[theirs]) ** 2, axis=0))
     assert len(log) > 0.95 * len(base()) and off.max() < 1.0
+
+
+def test_a_base_that_stands_askew_is_told_and_learned_on() -> None:
+    along = (0.34, -0.2, -9.8021)  # two degrees, with 1 kg in the hand
+    log, stands, said = check_torque(base(along), panda_model())
+    np.testing.assert_allclose(stands.gravity, along, atol=0.03)
+    assert len(log) == len(base(along)) and "stands askew" in said[0] and "--gravity 0.3" in said[0]
+    assert abs(find_load(base(along), panda_model()).mass - LOAD_KG) < 0.05
+    _, level, said = check_torque(base(), panda_model())
+    assert np.array_equal(level.gravity, panda_model().gravity) and not said
 
 
 def test_an_arm_that_rests_may_well_hold_the_same_torque() -> None:

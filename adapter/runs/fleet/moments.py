@@ -167,7 +167,7 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
     log = matching(log, model)
     if not len(log):
         raise DriverError("no samples to learn from")
-    log, _ = check_torque(log, model)
+    log, model, _ = check_torque(log, model)
     settings, _ = fitted_to(log, PipelineSettings().filter)
     both = PipelineSettings(filter=settings, learner=_learning(model))
     front_end, learner = make_front_end(model, both), make_learner(model, both)
