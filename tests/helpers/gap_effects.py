@@ -96,7 +96,7 @@ def _wrench_torque(truth: Truth, effect: Effect, q: Array, on: Array) -> Array:
 def link_side(effect: Effect, t: Array, q: Array, dq: Array, ddq: Array, tau: Array) -> Array:
     """Torque (m,) of an effect on one joint, from that joint's motion and rigid torque."""
     p: dict[str, Any] = dict(effect.parameters)
-    sign = np.sign(dq)
+    sign = np.sign(np.round(dq, 6))  # no rounding error of a joint at rest throws it about
     match effect.name:
         case "viscous_friction":
             return p["Fv"] * dq
