@@ -29,7 +29,8 @@ def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
     Joints (from 0) that are `without` any law keep what they have.
     """
     for joint in sorted({e.candidate.joint for e in fit.named if _gives_way(e)}):
-        fit = _falling(fit, joint)
+        if any(e.candidate.joint == joint and _nameless(e) for e in fit.named):
+            fit = falling(fit, joint)
         fit = _of_joint(fit, joint, MOST_TERMS if joint not in without else 0)
     return fit
 
@@ -97,14 +98,14 @@ def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
     return fit
 
 
-def _falling(fit: Fit, joint: int) -> Fit:
+def falling(fit: Fit, joint: int) -> Fit:
     """With bristles whose level falls with the speed, where that says more than what has no name.
 
     Bristles of one level have the doubt of slow rows, which hides that they are not of one level.
     """
     places = [k for k, e in enumerate(fit.named) if e.candidate.joint == joint and _nameless(e)]
     bare = fit.with_named([e for k, e in enumerate(fit.named) if k not in places])
-    for k, e in enumerate(bare.named if places else ()):
+    for k, e in enumerate(bare.named):
         if e.candidate.effect is not BRISTLES or e.candidate.joint != joint:
             continue
         template = STRIBECK.reshaped({"vs": STRIBECK_SPEED, "s0": e.values["s0"]}, 1.0)[0]

@@ -27,7 +27,7 @@ from adapter.gap.fit import (
     worth,
 )
 from adapter.gap.folds import Folds, pays_held_out
-from adapter.gap.laws import lawful, left_without
+from adapter.gap.laws import STRIBECK, falling, lawful, left_without
 from adapter.gap.real_arm import BRISTLES, COULOMB, start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
@@ -50,6 +50,7 @@ FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction 
 CLEAR = 3.0  # standard deviations of a force
 WEIGHTLESS = 1e-9  # m/s², least gravity
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
+FALLS_CHI2 = 4.0  # that friction which falls with the speed must say more to be looked at closely
 RESOLVED_CHI2 = 4.0  # that bristles must be better than friction that slides at once
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
@@ -120,6 +121,8 @@ def search(
     fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
     found = settled(_renamed(fit, joints), joints)
+    fit = _falling(found)
+    found = found if fit is found.fit else settled(fit, joints)
     progress("laws of what no effect explains")
     fit = lawful(found.fit)
     if fit is not found.fit:
@@ -127,6 +130,17 @@ def search(
         found = settled(lawful(found.fit, lawless), joints) if lawless else judged
     found = _as_resolved(found)
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)
+
+
+def _falling(found: Found) -> Fit:
+    """With friction that falls with the speed, on joints where all that is left has a name."""
+    fit, patterns = found.fit, {e.candidate.joint for e in found.fit.named if e.is_pattern}
+    for own in found.standings:
+        key, asked = (STRIBECK.name, own.candidate.joint), own.chi2 + FALLS_CHI2
+        more = any(x.candidate.key == key and x.is_alike and x.chi2 > asked for x in own.rivals)
+        if own.candidate.effect is BRISTLES and more and key[1] not in patterns:
+            fit = falling(fit, key[1])
+    return fit
 
 
 def _extended(
