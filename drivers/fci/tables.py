@@ -37,15 +37,32 @@ LIBFRANKA = {  # by protocol version
 
 MOVE_STATUS = {
     PANDA: (
-        "success", "motion_started", "preempted", "not_possible", "singular_start",
-        "invalid_argument", "reflex", "user_stop", "input_error", "aborted",
-    ),
-    FR3: (
-        "success", "motion_started", "preempted", "preempted_by_safety", "rejected_by_safety",
-        "not_possible", "singular_start", "invalid_argument", "reflex", "user_stop", "input_error",
+        "success",
+        "motion_started",
+        "preempted",
+        "not_possible",
+        "singular_start",
+        "invalid_argument",
+        "reflex",
+        "user_stop",
+        "input_error",
         "aborted",
     ),
-}  # fmt: skip
+    FR3: (
+        "success",
+        "motion_started",
+        "preempted",
+        "preempted_by_safety",
+        "rejected_by_safety",
+        "not_possible",
+        "singular_start",
+        "invalid_argument",
+        "reflex",
+        "user_stop",
+        "input_error",
+        "aborted",
+    ),
+}
 STOP_STATUS = {
     PANDA: ("success", "not_possible", "user_stop", "reflex", "aborted"),
     FR3: ("success", "not_possible", "rejected_by_safety", "user_stop", "reflex", "aborted"),
@@ -53,10 +70,15 @@ STOP_STATUS = {
 RECOVER_STATUS = {
     PANDA: ("success", "not_possible", "manual_recovery", "reflex", "user_stop", "aborted"),
     FR3: (
-        "success", "not_possible", "rejected_by_safety", "manual_recovery", "reflex", "user_stop",
+        "success",
+        "not_possible",
+        "rejected_by_safety",
+        "manual_recovery",
+        "reflex",
+        "user_stop",
         "aborted",
     ),
-}  # fmt: skip
+}
 SET_STATUS = ("success", "not_possible", "invalid_argument", "rejected_by_safety")  # FR3: the last
 
 MEANING = {
