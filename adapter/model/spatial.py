@@ -141,7 +141,7 @@ def z_to_axis(axis: ArrayLike) -> Array:
     u = np.asarray(axis, dtype=np.float64)
     u = u / np.linalg.norm(u)
     sine = float(np.hypot(u[0], u[1]))
-    if sine == 0.0:
+    if sine < 1e-290:  # nothing, or subnormal numbers, which have lost its direction
         return np.eye(3) if u[2] > 0 else np.diag([1.0, -1.0, -1.0])
     k = skew([-u[1] / sine, u[0] / sine, 0.0])
     out: Array = np.eye(3) + sine * k + (1.0 - u[2]) * (k @ k)

@@ -46,5 +46,5 @@ def test_a_walk_finds_what_is_there(seed, most):
     data = data[: len(data) - int(rng.integers(0, 60))] + bytes(int(rng.integers(0, 40)))
     found = walk(memoryview(data), 0, frozenset({INVALID}), most)
     start, stop, end = one_by_one(data, most)
-    assert (found.start, found.stop, found.end) == (start, stop, end)
+    assert (list(found.start), list(found.stop), found.end) == (start, stop, end)
     assert found.full == (most is not None and len(start) == most and end < len(data))
