@@ -610,5 +610,10 @@ def _moved(fit: Fit, place: int, side: int, t: float) -> Fit:
 
 def _distance(fit: Fit) -> float:
     """Squared distance, in units of the noise, with what the coefficients cost."""
-    white = fit.whiten(fit.model.residuals())
+    return distance_of(fit, fit.model.residuals())
+
+
+def distance_of(fit: Fit, left: Sequence[Array]) -> float:
+    """The same where a fit leaves `left` (k, n), N m, of each recording."""
+    white = fit.whiten(left)
     return float(white @ white + np.sum((fit.coefficients / fit.prior_std) ** 2))

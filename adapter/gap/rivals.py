@@ -12,7 +12,7 @@ from adapter.effects.base import LATE
 from adapter.effects.torque import sensors
 from adapter.gap.candidates import Candidate, is_finer, log_odds, simpler_wins
 from adapter.gap.evidence import Carried, scores
-from adapter.gap.fit import Fit, Named, beside, refitted
+from adapter.gap.fit import Fit, Named, beside, distance_of, refitted
 from adapter.gap.scan import SignatureTable
 from adapter.model.spatial import Array
 
@@ -128,7 +128,8 @@ def _standing(
     value = mine.log_evidence + price(named)
     found = _rivals(named, candidates, products, carried, own, rest)
     if named.candidate.effect.form == LATE and value > 0.0:
-        found = [_exact(fit, k, mine.chi2, rival) for rival in found]
+        without = mine.chi2 + _in_band(fit)
+        found = [_exact(fit, k, without, rival) for rival in found]
     best: dict[tuple[str, int], Rival] = {}
     for rival in sorted(found, key=lambda x: -x.log_evidence):
         if named.interval_s == WHOLE or not rival.candidate.effect.steady:
@@ -141,15 +142,18 @@ def _standing(
     return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.tried)
 
 
-def _exact(fit: Fit, k: int, chi2: float, rival: Rival) -> Rival:
-    """A rival of the k-th named effect, worth `chi2`, as a fit has it in that one's place.
+def _exact(fit: Fit, k: int, without: float, rival: Rival) -> Rival:
+    """A rival of the k-th named effect as a fit has it in that one's place.
 
     Only of what makes torques late, which is linear for less than a sample or two alone.
+
+    Args:
+        without: squared distance in the band with neither.
     """
     if not (rival.is_alike and rival.candidate.effect.form == LATE):
         return rival
     trial, _ = refitted(fit.instead(k, replace(fit.named[k], candidate=rival.candidate, x=rival.x)))
-    told = chi2 + _in_band(fit) - _in_band(trial)
+    told = without - _in_band(trial)
     worth, x = rival.log_evidence + 0.5 * (told - rival.chi2), trial.named[k].x
     credible = rival.candidate.possible(x, fit.named[k].interval_s)
     return replace(rival, log_evidence=worth, chi2=told, x=x, credible=credible)
@@ -163,8 +167,7 @@ def _in_band(fit: Fit) -> float:
         rigid = np.column_stack([at.links.inside_band(x, j) for j, x in enumerate(at.rigid.T)])
         sensed = sensors(at.links, rigid + at.total - at.rigid, actives)
         left.append(own.heard * (own.tau - own.low(sensed)))
-    white = fit.whiten(left)
-    return float(white @ white + np.sum((fit.coefficients / fit.prior_std) ** 2))
+    return distance_of(fit, left)
 
 
 def _rivals(
