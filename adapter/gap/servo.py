@@ -12,15 +12,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adapter.gap.servo_fit import (
+    ALL_FREE,
     DELAY,
     PARAMETERS,
     Freedom,
     JointFit,
     JointTask,
+    blocks,
     first_guess,
     fit_joint,
 )
-from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Load
+from adapter.gap.servo_ground import LEAST_JOINTS, above, find_ground
+from adapter.gap.servo_kernels import (
+    DAMPING,
+    INERTIA,
+    LEAD,
+    NO_GROUND,
+    RUBS,
+    A,
+    Ground,
+    Load,
+)
 from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_signals import Track, loads
 from adapter.judgement.priors import theta_prior
@@ -37,13 +49,13 @@ LEAST_DELAY_S = 1e-5  # standard deviation of one joint's, at least
 DOCUMENTED_DELAY_S = 5e-5  # the same of a delay
 SHOWN = 2.0  # from zero, where nobody documented a value: every servo has some of it
 TIE_CHI2 = 4.0  # by which an effect must foretell blocks that its fit has not seen better
-BLOCK_S = 2.0  # of alternating blocks
 FITTED_SHARE = 2.0 / 3.0  # of a recording, where none is held out
 DRAWS = 8  # of inertias as wrong as the documentation may be
 OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
-ALL_FREE = Freedom(np.ones(PARAMETERS, dtype=bool), np.zeros(PARAMETERS))
+ROUGH_STEP_S = 8e-3  # of the first simulations
+TOUCHED_S, LEAST_TOUCHED = 1.0, 2  # for so long, in so many recordings: its place is known
 
 UNITS = {
     "servo_position_gain": ("kp", "N m/rad"),
@@ -94,6 +106,8 @@ class ServoGap:
             the fit has not seen: recordings held out, or the last third.
         scored: which data these are, in words.
         scale_open: joints (from 1) whose documented masses do not show the gains' scale.
+        ground: what the hand came down on, if anything; touched: for how long, s, in each recording
+            that is fitted.
         notes: a sentence each.
     """
 
@@ -106,6 +120,8 @@ class ServoGap:
     after: Array
     scored: str
     scale_open: tuple[int, ...] = ()
+    ground: Ground = NO_GROUND
+    touched: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -117,6 +133,7 @@ class _Arm:
     documented: ServoModel
     tracks: tuple[Track, ...]
     inertia_prior: float
+    ground: Ground = NO_GROUND
 
     def fixed(self, j: int) -> Array:
         """(6,) documented parameters of a joint, as `Freedom` takes them."""
@@ -129,7 +146,7 @@ class _Arm:
 
     def tasks(self, motions: Sequence[Array]) -> list[JointTask]:
         """One for each joint, all judged readings, under the loads of these motions."""
-        each = [loads(self.rigid, motion) for motion in motions]
+        each = [loads(self.rigid, motion, self.ground) for motion in motions]
         rows = [track.judged for track in self.tracks]
         n = self.rigid.n
         return [JointTask(j, self.tracks, [own[j] for own in each], rows) for j in range(n)]
@@ -141,7 +158,7 @@ class _Arm:
             off = theta_prior(self.rigid.theta, self.inertia_prior)
             theta = self.rigid.theta + off * rng.standard_normal(off.shape)
             arm = self.rigid.changed(theta=theta)
-            found.append([loads(arm, motion) for motion in motions])
+            found.append([loads(arm, motion, self.ground) for motion in motions])
         return found
 
 
@@ -167,7 +184,7 @@ def explain(
     documented = documented or ServoModel.ideal(names)
     tracks = tuple(_track(log, names) for log in logs)
     unseen = tuple(_track(log, names) for log in hold_out)
-    arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior)
+    arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior, documented.ground)
     progress("fitting each joint's servo")
     # of an encoder's reading, by its third differences
     noise = np.max(
@@ -178,8 +195,13 @@ def explain(
         fits: list[JointFit] = []
         servos = documented
     else:
-        fits = _named(arm, _rough(arm), progress)
+        arm, fits = _rough(arm, [log.select(names) for log in logs], noise)
+        fits = _named(arm, fits, progress)
         servos = _servos(arm, fits)
+    touched = tuple(_touched(arm, track) for track in tracks)
+    known = arm.ground is documented.ground or sum(x > TOUCHED_S for x in touched) >= LEAST_TOUCHED
+    if not known:  # where it lies in other poses, one motion does not tell
+        servos = replace(servos, ground=NO_GROUND)
     progress("foretelling what was held out")
     before, after, scored = _scored(arm, fits, servos, unseen)
     found = _Table(arm)
@@ -198,6 +220,8 @@ def explain(
         after=after,
         scored=scored,
         scale_open=tuple(found.scale_open),
+        ground=arm.ground,
+        touched=touched,
         notes=(*(w for log in logs for w in log.warnings), *found.notes),
     )
 
@@ -222,10 +246,30 @@ def _track(log: Log, names: tuple[str, ...]) -> Track:
     return track
 
 
-def _rough(arm: _Arm) -> list[JointFit]:
-    """All numbers of all joints, the load being that of the motion as it was measured."""
+def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[JointFit]]:
+    """All numbers of all joints, the load being that of the motion as it was measured.
+
+    First on long steps; what these leave beyond the encoders' noise may be something that the hand
+    came down on.
+    """
+    tracks = tuple(Track.of(log, ROUGH_STEP_S) for log in logs)
+    tasks = replace(arm, tracks=tracks).tasks([track.smooth for track in tracks])
+    fits = [fit_joint(task, ALL_FREE, first_guess(task)) for task in tasks]
+    x = np.array([fit.x for fit in fits])
+    left = np.sqrt([fit.error() / sum(map(np.sum, fit.task.rows)) for fit in fits])
+    if arm.ground.root == 0.0 and np.sum(left > NOISE_SHARE * noise) >= LEAST_JOINTS:
+        ground, x = find_ground(arm.rigid, tasks, x)
+        arm = replace(arm, ground=ground)
     tasks = arm.tasks([track.smooth for track in arm.tracks])
-    return [fit_joint(task, ALL_FREE, first_guess(task)) for task in tasks]
+    return arm, [fit_joint(task, ALL_FREE, own) for task, own in zip(tasks, x, strict=True)]
+
+
+def _touched(arm: _Arm, track: Track) -> float:
+    """Seconds for which the hand was on the ground."""
+    if arm.ground.root == 0.0:
+        return 0.0
+    on = above(arm.rigid, arm.ground, track.smooth[0]) < 0.0
+    return float(track.step_s * np.sum(on))
 
 
 def _motions(arm: _Arm, fits: Sequence[JointFit]) -> list[Array]:
@@ -291,18 +335,11 @@ def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     return found
 
 
-def _blocks(task: JointTask, part: int) -> JointTask:
-    """On every second block of time."""
-    pairs = zip(task.tracks, task.rows, strict=True)
-    rows = [take & ((track.stamp_s // BLOCK_S).astype(int) % 2 == part) for track, take in pairs]
-    return replace(task, rows=rows)
-
-
 def _paid(fit: JointFit, without: JointFit) -> float:
     """By how much a fit foretells blocks it has not seen better than another, in chi squared."""
     gain = 0.0
     for part in (0, 1):
-        seen, unseen = _blocks(fit.task, part), _blocks(fit.task, 1 - part)
+        seen, unseen = blocks(fit.task, part), blocks(fit.task, 1 - part)
         errors = [
             JointFit(unseen, f.freedom, fit_joint(seen, f.freedom, f.x).x).error()
             for f in (without, fit)
@@ -384,6 +421,7 @@ def _servos(arm: _Arm, fits: Sequence[JointFit]) -> ServoModel:
         x[:, INERTIA] * kp,
         np.asarray(fed),
         float(np.median(x[:, DELAY])),
+        arm.ground,
     )
 
 

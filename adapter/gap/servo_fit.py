@@ -21,9 +21,13 @@ from adapter.model.spatial import Array
 DELAY = 5  # column after those of the servo
 PARAMETERS = 6
 LATEST_S, EVERY_S = 0.05, 1e-3  # of the delays that are tried
+BLOCK_S = 2.0  # of alternating blocks
 MEMORY_S = 0.5  # beyond which what is left of a fit does not know itself
 LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3])  # scale of a parameter that is zero
 NUDGE = 1e-3  # of its scale, for derivatives
+OUTLIER_RAD = 5e-3  # beyond which what the model does not know is no noise
+FAR_RAD = 10.0  # at which a simulated motion that runs away is cut
+ALIKE = 10.0  # factor by which a position gain is sought around its start, the other joints'
 UNTOLD = 10.0  # scales, one standard deviation of what readings do not tell
 ROUNDS, MILLI = 40, 1e3  # of a fit, at most; it goes by mrad
 
@@ -53,9 +57,10 @@ class JointTask:
         return found
 
     def fitted(self, x: Array) -> Array:
-        """What they leave of the readings that are fitted, rad."""
+        """What they leave of the readings that are fitted, rad; a motion that runs away is cut."""
         rows = zip(self.left(x), self.rows, strict=True)
-        return np.concatenate([left[take] for left, take in rows])
+        left = np.concatenate([left[take] for left, take in rows])
+        return np.clip(np.nan_to_num(left, nan=FAR_RAD), -FAR_RAD, FAR_RAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,9 @@ class Freedom:
         free = self.free.copy()
         free[k] = False
         return replace(self, free=free)
+
+
+ALL_FREE = Freedom(np.ones(PARAMETERS, dtype=bool), np.zeros(PARAMETERS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,18 +134,8 @@ class JointFit:
 
     @cached_property
     def unit(self) -> float:
-        """Squares (rad²) that one unit of chi squared is worth, neighbours knowing each other."""
-        task, most = self.task, 1.0
-        # how many neighbours tell as much as one that knows nothing of its neighbours
-        for left, track, take in zip(task.left(self.x), task.tracks, task.rows, strict=True):
-            own = np.where(take, left, 0.0)
-            lags = max(int(MEMORY_S / np.median(np.diff(track.stamp_s))), 1)
-            size = 1 << int(np.ceil(np.log2(2 * len(own))))
-            power = np.fft.irfft(np.abs(np.fft.rfft(own, size)) ** 2)[:lags]
-            share = power / max(power[0], 1e-30)
-            below = np.flatnonzero(share < 0.05)
-            most = max(most, 1.0 + 2.0 * float(share[1 : below[0] if below.size else lags].sum()))
-        return float(np.mean(task.fitted(self.x) ** 2)) * most
+        """Squares (rad²) that one unit of chi squared is worth, see `chi2_unit`."""
+        return chi2_unit(self.task, self.x)
 
     def moved(self, others: Sequence[Sequence[Load]]) -> Array:
         """(s, f) by how much the parameters over their scales would move under other loads."""
@@ -147,9 +145,36 @@ class JointFit:
         return np.array([gain @ (task.fitted(self.x) - here) for task in moved])
 
     def error(self) -> float:
-        """Sum of squares over the readings that its task fits, rad²."""
-        left = self.task.fitted(self.x)
-        return float(left @ left)
+        """What it leaves of the readings that its task fits, rad², see `misfit`."""
+        return misfit(self.task.fitted(self.x))
+
+
+def chi2_unit(task: JointTask, x: Array) -> float:
+    """Squares (rad²) that one unit of chi squared is worth, neighbours knowing each other."""
+    most = 1.0
+    # how many neighbours tell as much as one that knows nothing of its neighbours
+    for left, track, take in zip(task.left(x), task.tracks, task.rows, strict=True):
+        own = np.where(take, left, 0.0)
+        lags = max(int(MEMORY_S / np.median(np.diff(track.stamp_s))), 1)
+        size = 1 << int(np.ceil(np.log2(2 * len(own))))
+        power = np.fft.irfft(np.abs(np.fft.rfft(own, size)) ** 2)[:lags]
+        share = power / max(power[0], 1e-30)
+        below = np.flatnonzero(share < 0.05)
+        most = max(most, 1.0 + 2.0 * float(share[1 : below[0] if below.size else lags].sum()))
+    left = task.fitted(x)
+    return misfit(left) / len(left) * most
+
+
+def misfit(left: Array) -> float:
+    """Sum of squares (rad²) of what is left, that of outliers growing by their size alone."""
+    return float(2.0 * OUTLIER_RAD**2 * np.sum(np.sqrt(1.0 + (left / OUTLIER_RAD) ** 2) - 1.0))
+
+
+def blocks(task: JointTask, part: int) -> JointTask:
+    """On every second block of time."""
+    pairs = zip(task.tracks, task.rows, strict=True)
+    rows = [take & ((track.stamp_s // BLOCK_S).astype(int) % 2 == part) for track, take in pairs]
+    return replace(task, rows=rows)
 
 
 def fit_joint(task: JointTask, freedom: Freedom, start: Array) -> JointFit:
@@ -165,9 +190,21 @@ def fit_joint(task: JointTask, freedom: Freedom, start: Array) -> JointFit:
     def slopes(z: Array) -> Array:
         return _slopes(task, freedom, z * scale, scale) * MILLI
 
-    begin, ends = x[freedom.free] / scale, (0.0, np.inf)
+    low, high = np.zeros(PARAMETERS), np.full(PARAMETERS, np.inf)
+    if x[A] > 0.0:  # what the masses hardly load tells no gain
+        low[A], high[A] = x[A] / ALIKE, x[A] * ALIKE
+    ends = low[freedom.free] / scale, high[freedom.free] / scale
+    begin = np.clip(x[freedom.free] / scale, *ends)
     found = least_squares(
-        left, begin, jac=slopes, bounds=ends, xtol=1e-5, ftol=1e-7, max_nfev=ROUNDS
+        left,
+        begin,
+        jac=slopes,
+        bounds=ends,
+        loss="soft_l1",  # as `misfit`
+        f_scale=MILLI * OUTLIER_RAD,
+        xtol=1e-5,
+        ftol=1e-7,
+        max_nfev=ROUNDS,
     )
     return JointFit(task, freedom, freedom.full(found.x * scale))
 
@@ -188,10 +225,12 @@ def first_guess(task: JointTask) -> Array:
     best, least, pairs = np.zeros(PARAMETERS), np.inf, zip(task.tracks, task.loads, strict=True)
     sides = [_equation(track, load, task.joint) for track, load in pairs]
     for delay in np.arange(0.0, LATEST_S, EVERY_S):
-        rows = [side(delay) for side in sides]
-        matrix, wanted = (np.concatenate(part) for part in zip(*rows, strict=True))
+        both = zip(*(side(delay) for side in sides), strict=True)
+        matrix, wanted = (np.concatenate(part) for part in both)
         size = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-12)
-        x, left = nnls(matrix / size, wanted)
+        # the triangle of all rows is as good as they are, and small
+        rows = np.asarray(np.linalg.qr(np.column_stack([matrix / size, wanted]), mode="r"))
+        x, left = nnls(rows[:, :-1], rows[:, -1])
         if left < least:
             least, best = left, np.array([*(x / size), delay])
     return best

@@ -8,7 +8,7 @@ scale that only the documented masses set):
 with a = 1 / kp, lead the fed-forward speed's gain over kp (s), damping (s) that of the velocity
 gain and viscous friction together, inertia the armature's (s²), rubs Coulomb friction's (rad).
 Both simulations take the implicit midpoint rule, and friction holds a joint whose speed would
-change sign.
+change sign. Where the hand rests on something level, a stiff spring carries it (`Ground`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from adapter.physics.kernels import (
     inverse_dynamics,
     jit,
     link_motion,
+    place_frames,
 )
 
 SWEEPS, SETTLED = 60, 1e-9  # of the joints' speeds in a step; rad/s
@@ -37,18 +38,88 @@ class Load(NamedTuple):
     Attributes:
         mass: moment of inertia that the joint moves, kg m².
         other: the rigid torque beside mass times acceleration, N m.
+        lift: what the hand rises by per rad of the joint, times the root of the ground's stiffness.
+        gap: how far it is above the ground with the joint at zero, times the same.
     """
 
     mass: Array
     other: Array
+    lift: Array
+    gap: Array
+
+
+class Ground(NamedTuple):
+    """Something level and stiff that carries the hand where it comes down on it.
+
+    Attributes:
+        link: (from 0) that touches it; point: (3,) m, where, in that link's frame.
+        up: (3,) unit vector, base axes; height: m, over the base's origin.
+        root: of its stiffness, sqrt(N/m); 0 where there is none.
+    """
+
+    link: int
+    point: Array
+    up: Array
+    height: float
+    root: float
+
+
+NO_GROUND = Ground(0, np.zeros(3), np.zeros(3), 0.0, 0.0)
 
 
 class Body(NamedTuple):
-    """The rigid arm as compiled code takes it."""
+    """The rigid arm, and what it may come down on, as compiled code takes it."""
 
     frames: Frames
     theta: Array
     base: Array
+    ground: Ground
+
+
+@jit
+def above_ground(frames, ground, q, lift):
+    """How far the hand is above the ground, times the root of its stiffness.
+
+    Args:
+        frames: `Frames`; ground: `Ground`; q: (n,) rad.
+        lift: (n,) what it rises by per rad of each joint, times the same, filled.
+    """
+    n = q.shape[0]
+    R, o = np.empty((n, 3, 3)), np.empty((n, 3))
+    place_frames(frames, q, R, o)
+    link, point, up, x = ground.link, ground.point, ground.up, np.empty(3)
+    for r in range(3):
+        x[r] = o[link, r]
+        for k in range(3):
+            x[r] += R[link, r, k] * point[k]
+    lift[:] = 0.0
+    j = link
+    while j >= 0:
+        u, v, w = x[0] - o[j, 0], x[1] - o[j, 1], x[2] - o[j, 2]
+        a, b, c = R[j, 0, 2], R[j, 1, 2], R[j, 2, 2]
+        risen = up[0] * (b * w - c * v) + up[1] * (c * u - a * w) + up[2] * (a * v - b * u)
+        lift[j] = ground.root * risen
+        j = frames.parent[j]
+    return ground.root * (up[0] * x[0] + up[1] * x[1] + up[2] * x[2] - ground.height)
+
+
+@jit
+def all_above_ground(frames, ground, q, lift, above):
+    """Tables of `above_ground`: q (m, n); lift (m, n) and above (m,) are filled."""
+    for k in range(q.shape[0]):
+        above[k] = above_ground(frames, ground, q[k], lift[k])
+
+
+@jit
+def between(at, t, table, out):
+    """A table (k, n) over t (k,), at (m,), between its rows by a line: out (m, n). Both ascend."""
+    k, last = 0, t.shape[0] - 2
+    for i in range(at.shape[0]):
+        while k < last and t[k + 1] <= at[i]:
+            k += 1
+        share = min(max((at[i] - t[k]) / (t[k + 1] - t[k]), 0.0), 1.0)
+        for j in range(table.shape[1]):
+            out[i, j] = table[k, j] + share * (table[k + 1, j] - table[k, j])
 
 
 @jit
@@ -65,22 +136,25 @@ def follow_alone(x, goal, load, start, step, q):
     damping, rubs = x[DAMPING], x[RUBS]
     for k in range(goal.shape[0]):
         mass = x[A] * load.mass[k] + x[INERTIA]
-        steers = goal[k] - x[A] * load.other[k]
+        steers, holds = goal[k] - x[A] * load.other[k], 1.0
+        if load.gap[k] + load.lift[k] * at < 0.0:
+            steers -= x[A] * load.lift[k] * load.gap[k]
+            holds += x[A] * load.lift[k] ** 2
         left = step
         if speed != 0.0:
             way = 1.0 if speed > 0.0 else -1.0
-            pull = 2.0 * mass / step * speed + steers - at - way * rubs
-            after = 2.0 * pull / (2.0 * mass / step + 0.5 * step + damping) - speed
+            pull = 2.0 * mass / step * speed + steers - holds * at - way * rubs
+            after = 2.0 * pull / (2.0 * mass / step + 0.5 * step * holds + damping) - speed
             # It stops within the step: only up to there does friction act this way. What follows
             # from the numbers then has no jumps, which a fit would be caught by.
             share = speed / (speed - after) if after * way < 0.0 else 1.0
             at += 0.5 * share * step * (speed + (after if share == 1.0 else 0.0))
             speed = after if share == 1.0 else 0.0
             left = (1.0 - share) * step
-        force = steers - at
+        force = steers - holds * at
         if left > 0.0 and abs(force) > rubs:
             force -= rubs if force > 0.0 else -rubs
-            middle = force / (2.0 * mass / left + 0.5 * left + damping)
+            middle = force / (2.0 * mass / left + 0.5 * left * holds + damping)
             speed, at = 2.0 * middle, at + left * middle
         q[k] = at
 
@@ -99,8 +173,13 @@ def follow_together(x, goal, body, start, step, q):
     still, unit, motion = np.zeros(n), np.zeros(n), np.empty((n, 12))
     bias, column, base = np.empty(n), np.empty(n), np.zeros(12)
     mass, pull, ahead = np.empty((n, n)), np.empty(n), np.empty(n)
-    before = speed.copy()
+    before, lift = speed.copy(), np.zeros(n)
     for k in range(goal.shape[0]):
+        above = 1.0
+        if body.ground.root > 0.0:
+            above = above_ground(body.frames, body.ground, at, lift)
+        if above >= 0.0:
+            lift[:] = 0.0
         for j in range(n):
             ahead[j] = 1.5 * speed[j] - 0.5 * before[j]
         midway = at + 0.5 * step * speed
@@ -116,15 +195,18 @@ def follow_together(x, goal, body, start, step, q):
             own = x[j, INERTIA] * speed[j]
             for i in range(n):
                 own += x[j, A] * mass[j, i] * speed[i]
-            pull[j] = 2.0 / step * own + goal[k, j] - at[j] - x[j, A] * bias[j]
+            pull[j] = 2.0 / step * own + goal[k, j] - at[j]
+            pull[j] -= x[j, A] * (bias[j] + lift[j] * above)
         for _ in range(SWEEPS):
             change = 0.0
             for j in range(n):
                 left = pull[j]
                 for i in range(n):
                     if i != j:
-                        left -= 2.0 / step * x[j, A] * mass[j, i] * middle[i]
+                        both = 2.0 / step * mass[j, i] + 0.5 * step * lift[j] * lift[i]
+                        left -= x[j, A] * both * middle[i]
                 own = 2.0 / step * (x[j, A] * mass[j, j] + x[j, INERTIA])
+                own += 0.5 * step * x[j, A] * lift[j] ** 2
                 new = 0.0
                 if abs(left) > x[j, RUBS]:
                     left -= x[j, RUBS] if left > 0.0 else -x[j, RUBS]

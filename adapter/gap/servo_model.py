@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.errors import ModelError
-from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Body, follow_together
+from adapter.gap.servo_kernels import (
+    DAMPING,
+    INERTIA,
+    LEAD,
+    NO_GROUND,
+    RUBS,
+    A,
+    Body,
+    Ground,
+    follow_together,
+)
 from adapter.gap.servo_signals import Track
 from adapter.model.spatial import Array
 from adapter.physics.kernels import base_at_rest
@@ -33,6 +44,7 @@ class ServoModel:
         delay_s: from a command's stamp until it acts.
         feeds_speed: (n,) whether the velocity gain acts on the command's speed less the joint's.
             Where it does not, velocity gain and viscous friction do the same: their sum counts.
+        ground: what the hand comes down on, if anything.
     """
 
     joint_names: tuple[str, ...]
@@ -43,6 +55,7 @@ class ServoModel:
     armature: Array
     feeds_speed: NDArray[np.bool_]
     delay_s: float = 0.0
+    ground: Ground = NO_GROUND
 
     @classmethod
     def ideal(cls, joint_names: tuple[str, ...]) -> ServoModel:
@@ -73,7 +86,7 @@ class ServoModel:
         x = self.table()
         goal = track.goal(x[:, LEAD], self.delay_s)
         q = np.empty_like(goal)
-        body = Body(arm.frames, arm.theta, base_at_rest(arm.gravity))
+        body = Body(arm.frames, arm.theta, base_at_rest(arm.gravity), self.ground)
         follow_together(x, goal, body, track.start, track.step_s, q)
         return q
 
@@ -93,7 +106,24 @@ class ServoModel:
             lines += ["", "[[joint]]", f'name = "{quoted}"']
             lines += [f"{key} = {float(getattr(self, key)[j]):.6g}" for key in KEYS]
             lines.append(f"feeds_speed = {str(bool(self.feeds_speed[j])).lower()}")
+        if facts := ground_facts(self.ground, self.joint_names):
+            told = "what the hand comes down on: behind which joint, where in that link's frame"
+            lines += ["", f"# {told}, m, N/m", "[ground]"]
+            lines += [f"{key} = {json.dumps(value)}" for key, value in facts.items()]
         path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def ground_facts(ground: Ground, joint_names: Sequence[str]) -> dict[str, Any]:
+    """A ground as it stands in files; empty where there is none."""
+    if ground.root == 0.0:
+        return {}
+    return {
+        "joint": joint_names[ground.link],
+        "point": ground.point.tolist(),
+        "up": ground.up.tolist(),
+        "height": ground.height,
+        "stiffness": ground.root**2,
+    }
 
 
 def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
@@ -107,10 +137,10 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
     joints = facts.get("joint")
     if not isinstance(joints, list) or not all(isinstance(j, dict) for j in joints):
         raise ModelError(f"{path}: needs a [[joint]] for each joint, with name and {KEYS[0]}")
-    strange = [key for key in facts if key not in ("delay_s", "joint")]
+    strange = [key for key in facts if key not in ("delay_s", "joint", "ground")]
     strange += [k for j in joints for k in j if k not in (*KEYS, "name", "feeds_speed")]
     if strange:
-        choices = ", ".join(("delay_s", "name", *KEYS, "feeds_speed"))
+        choices = ", ".join(("delay_s", "ground", "name", *KEYS, "feeds_speed"))
         raise ModelError(f"{path}: does not know {', '.join(strange)}; have: {choices}")
     told = {j.get("name"): j for j in joints}
     missing = [name for name in joint_names if name not in told]
@@ -123,7 +153,24 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
         key: np.array([_number(path, row, key, key == KEYS[0]) for row in rows]) for key in KEYS
     }
     found["feeds_speed"] = np.array([bool(row.get("feeds_speed", False)) for row in rows])
+    if "ground" in facts:
+        found["ground"] = _ground(path, facts["ground"], joint_names)
     return replace(servos, delay_s=_number(path, facts, "delay_s", False), **found)
+
+
+def _ground(path: Path, facts: Any, joint_names: tuple[str, ...]) -> Ground:
+    try:
+        link, root = joint_names.index(facts["joint"]), np.sqrt(facts["stiffness"])
+        point, up = (np.array(facts[key], dtype=float).reshape(3) for key in ("point", "up"))
+        ground = Ground(link, point, up, float(facts["height"]), float(root))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{path}: [ground] needs the joint (one of {', '.join(joint_names)}), point and up of "
+            f"three numbers, height and stiffness: {error}"
+        ) from error
+    if not (np.all(np.isfinite([*point, *up, ground.height, root])) and root > 0.0):
+        raise ModelError(f"{path}: [ground] has numbers that no ground has")
+    return ground
 
 
 def _number(path: Path, row: Mapping[str, Any], key: str, needed: bool) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from adapter.gap.servo_kernels import Load
+from adapter.gap.servo_kernels import Ground, Load, all_above_ground, between
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
@@ -43,13 +43,13 @@ class Track:
     smooth: Array
 
     @classmethod
-    def of(cls, log: Log) -> Track:
+    def of(cls, log: Log, longest_step_s: float = LONGEST_STEP_S) -> Track:
         """Prepare a recording whose commands are positions."""
         first, orders = log.stamp_ns[0], log.commands
         assert orders is not None and orders.q is not None
         stamp_s = 1e-9 * (log.stamp_ns - first).astype(float)
         period = float(np.median(np.diff(stamp_s)))
-        step = period / np.ceil(period / LONGEST_STEP_S - 1e-6)
+        step = period / np.ceil(period / longest_step_s - 1e-6)
         count = round(stamp_s[-1] / step)
         grid = step * np.arange(count + 1)
         at = 1e-9 * (orders.stamp_ns - first)
@@ -119,8 +119,10 @@ class Track:
 
 
 def columns(at: Array, t: Array, table: Array) -> Array:
-    """(m, n) of a table (k, n) over t (k,), between its rows by a line."""
-    return np.column_stack([np.interp(at, t, column) for column in table.T])
+    """(m, n) of a table (k, n) over t (k,), between its rows by a line; both ascend."""
+    out = np.empty((len(at), table.shape[1]))
+    between(at, t, table, out)
+    return out
 
 
 def smoothed(q: Array, step_s: float, period_s: float) -> Array:
@@ -131,8 +133,8 @@ def smoothed(q: Array, step_s: float, period_s: float) -> Array:
     return np.array([clean, dq, np.gradient(dq, step_s, axis=0)])
 
 
-def loads(arm: RigidArm, motion: Array) -> list[Load]:
-    """What the arm makes of each joint's motion, at the steps' middles.
+def loads(arm: RigidArm, motion: Array, ground: Ground) -> list[Load]:
+    """What the arm, and what it comes down on, make of each joint's motion, at the steps' middles.
 
     Args:
         motion: (3, m + 1, n) q, dq, ddq at the ends of the steps.
@@ -140,9 +142,13 @@ def loads(arm: RigidArm, motion: Array) -> list[Load]:
     q, dq, ddq = 0.5 * (motion[:, 1:] + motion[:, :-1])
     tau = arm.torque(q, dq, ddq)
     weightless, still, found = arm.changed(gravity=np.zeros(3)), np.zeros_like(q), []
+    lift, above = np.zeros_like(q), np.ones(len(q))
+    if ground.root > 0.0:
+        all_above_ground(arm.frames, ground, q, lift, above)
     for j in range(arm.n):
         unit = still.copy()
         unit[:, j] = 1.0
-        mass = np.ascontiguousarray(weightless.torque(q, still, unit)[:, j])
-        found.append(Load(mass, np.ascontiguousarray(tau[:, j] - mass * ddq[:, j])))
+        mass = weightless.torque(q, still, unit)[:, j]
+        columns = mass, tau[:, j] - mass * ddq[:, j], lift[:, j], above - lift[:, j] * q[:, j]
+        found.append(Load(*map(np.ascontiguousarray, columns)))
     return found

@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from adapter.gap.phrases import listed, numbered, shown_unit
 from adapter.gap.servo import TITLES, UNITS, ServoFinding, ServoGap
+from adapter.gap.servo_model import ground_facts
 from adapter.model.numbers import plain, plus_minus
 
 WORSE = 0.05  # share by which an error of a joint may grow, and unsaid
@@ -21,10 +22,35 @@ def headline(gap: ServoGap) -> str:
     if not gap.findings:
         return f"the arm does what its servos' documentation says: tracking as foretold to {before}"
     parts = [_short(finding) for finding in gap.findings]
+    if gap.ground.root > 0.0:
+        parts.insert(0, f"the hand came down on something {_height(gap)}")
     said = f"tracking error of the worst joint {before} -> {after} ({gap.scored})"
     worse = np.flatnonzero(gap.after > (1.0 + WORSE) * gap.before) + 1
     left = [f"joint {numbered(worse.tolist())}: not better"] if worse.size else []
     return "; ".join([*parts, said, *left])
+
+
+def _height(gap: ServoGap) -> str:
+    height = 1e3 * gap.ground.height
+    return f"{plain(abs(height), 2)} mm {'above' if height > 0.0 else 'below'} the base's origin"
+
+
+def _grounded(gap: ServoGap) -> str:
+    """Where and for how long, and whether it is foretold with."""
+    link, point = gap.joint_names[gap.ground.link], ", ".join(f"{x:.3f}" for x in gap.ground.point)
+    fitted = zip(gap.recordings, gap.touched, strict=False)  # those held out come behind
+    times = [f"{plain(s, 2)} s of {name}" for name, s in fitted if s]
+    said = (
+        f"the link behind {link} came down at ({point}) m of its frame on something level "
+        f"{_height(gap)}, of {plain(gap.ground.root**2, 2)} N/m, for {listed(times)}; the servos "
+        "are fitted beside it"
+    )
+    if gap.servos.ground.root > 0.0:
+        return said
+    return said + (
+        " and foretell without it: one motion does not tell where it lies in other poses; record "
+        "a second one that touches it, or none that does"
+    )
 
 
 def _short(finding: ServoFinding) -> str:
@@ -51,6 +77,8 @@ def lines(gap: ServoGap) -> list[str]:
             found.append(f"  joint {j}: {escape(said)}")
         if finding.open:
             found.append(f"  [dim]{escape(finding.open)}[/dim]")
+    if gap.ground.root > 0.0:
+        found.append(f"[green]•[/green] {escape(_grounded(gap))}")
     if gap.scale_open:
         which = numbered(gap.scale_open)
         found.append(
@@ -93,5 +121,7 @@ def as_json(gap: ServoGap) -> dict[str, Any]:
         "after": {"tracking_rmse_rad": gap.after},
         "scored_on": gap.scored,
         "scale_open": gap.scale_open,
+        "ground": ground_facts(gap.ground, gap.joint_names),
+        "touched_s": gap.touched,
         "notes": gap.notes,
     }

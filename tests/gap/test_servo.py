@@ -13,8 +13,9 @@ from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import ModelError
 from adapter.gap.servo import explain
-from adapter.gap.servo_kernels import Load, follow_alone
+from adapter.gap.servo_kernels import Ground, Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
+from adapter.gap.servo_words import headline
 from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import Log, read_position_log, write_log
 from tests.helpers.position_arm import (
@@ -75,6 +76,23 @@ def test_only_what_is_otherwise_than_documented_is_named() -> None:
     assert gap.after.max() < 0.1 * gap.before.max()
 
 
+def test_a_table_under_the_hand_is_told_from_the_servos() -> None:
+    """It holds and pushes several joints at once, and foretells where it does in another motion."""
+    free = position_arm(41, Drawn(16.0, 10e-3, 1e-4, feeds_speed=False))
+    height = 0.55
+    arm = replace(free, servos=replace(free.servos, table=(0.0, 0.0, 0.12, height, 2000.0)))
+    seen = [as_log(arm.moved("points", seed)) for seed in (41, 42)]
+    gap = explain(seen, PANDA, None, [as_log(arm.moved("points", 43))])
+    assert gap.ground.root > 0.0
+    assert abs(gap.ground.height - height) < 0.06
+    assert gap.servos.ground.root > 0.0
+    assert min(gap.touched) > 1.0
+    assert "the hand came down on something" in headline(gap)
+    assert np.median(gap.after) < 0.2 * np.median(gap.before)
+    alone = explain(seen[1:], PANDA, None, [seen[0]])
+    assert alone.ground.root > 0.0 == alone.servos.ground.root
+
+
 def test_an_arm_that_is_where_its_commands_are_has_nothing_named() -> None:
     recording = position_arm(23, Drawn(6.0)).moved("sines", 23)
     noise = 5e-5 * np.random.default_rng(23).standard_normal(recording.q.shape)
@@ -87,7 +105,7 @@ def test_one_joint_steps_as_a_linear_servo_does() -> None:
     """Without friction it is an oscillator of the second order, whose step is known."""
     step, x = 1e-4, np.array([2e-3, 0.0, 0.02, 1e-4, 0.0])
     m = 10000
-    load = Load(np.full(m, 0.15), np.zeros(m))
+    load = Load(np.full(m, 0.15), *np.zeros((3, m)))
     inertia = x[0] * 0.15 + x[3]
     omega, q = inertia**-0.5, np.empty(m)
     zeta = 0.5 * x[2] * omega
@@ -100,7 +118,7 @@ def test_one_joint_steps_as_a_linear_servo_does() -> None:
 def test_friction_holds_a_joint() -> None:
     """A step smaller than what friction holds moves nothing; a larger one stops short of it."""
     x, m, q = np.array([0.0, 0.0, 0.05, 1e-4, 0.01]), 5000, np.empty(5000)
-    load = Load(np.zeros(m), np.zeros(m))
+    load = Load(*np.zeros((4, m)))
     follow_alone(x, np.full(m, 0.009), load, np.zeros(2), 1e-3, q)
     assert not q.any()
     follow_alone(x, np.full(m, 0.05), load, np.zeros(2), 1e-3, q)
@@ -112,7 +130,7 @@ def test_a_stop_within_a_step_makes_no_jump() -> None:
     """A joint that rings and sticks ends hardly elsewhere under 0.1 microrad more of friction."""
     step, m = 1e-3, 3000
     t = step * np.arange(1, m + 1)
-    load, goal = Load(np.full(m, 0.15), np.zeros(m)), 0.1 * np.sign(np.sin(2.0 * np.pi * t))
+    load, goal = Load(np.full(m, 0.15), *np.zeros((3, m))), 0.1 * np.sign(np.sin(2.0 * np.pi * t))
     moved = []
     for rubs in 4e-3 + 1e-7 * np.arange(300):
         q = np.empty(m)
@@ -193,6 +211,7 @@ def test_a_recording_too_short_or_at_rest_is_refused() -> None:
         ("[[joint]]\nname = 'a'\nposition_gain = -1", "position_gain must be a number"),
         ("[[joint]]\nname = 'a'", "position_gain must be a number"),
         ("[[joint]]\nname = 'a'\nposition_gain = 0", "must be more than 0"),
+        ("[ground]\nup = 1\n[[joint]]\nname = 'a'\nposition_gain = 1", "needs the joint .one of a"),
     ],
 )
 def test_a_servo_file_is_checked(tmp_path: Path, text: str, said: str) -> None:
@@ -204,9 +223,13 @@ def test_a_servo_file_is_checked(tmp_path: Path, text: str, said: str) -> None:
 
 def test_a_servo_file_comes_back(tmp_path: Path) -> None:
     servos = position_arm(25).documentation
+    ground = Ground(6, np.array([0.0, 0.01, 0.1]), np.array([0.0, 0.0, 1.0]), -0.02, 20.0)
+    servos = replace(servos, ground=ground)
     servos.save(tmp_path / "servo.toml")
     back = read_servos(tmp_path / "servo.toml", servos.joint_names)
     for key in ("position_gain", "velocity_gain", "coulomb", "viscous", "armature", "feeds_speed"):
         assert np.allclose(getattr(back, key), getattr(servos, key), rtol=1e-5), key
     assert back.delay_s == servos.delay_s
+    assert back.ground.link == ground.link
+    assert np.allclose(np.hstack(back.ground[1:]), np.hstack(ground[1:]))
     assert not ServoModel.ideal(("a",)).table().any()

@@ -20,7 +20,7 @@ from adapter.gap.servo import UNITS, ServoGap
 from adapter.gap.servo_model import ServoModel
 from drivers.files.mcap import Commands, Log, McapWriter
 from sim.compiled import compiled
-from sim.dynamics import Frames, mass_matrix, torques
+from sim.dynamics import Frames, end_effector, mass_matrix, torques
 from sim.hidden.motion import draw_motion
 from sim.truth import Array, Truth, documented
 
@@ -38,6 +38,8 @@ class Servos:
         delay_s: from a command's stamp until it acts, whole milliseconds.
         feeds_speed: the servos derive the command's speed and feed it forward.
         noise_rad: standard deviation of an encoder's reading.
+        table: what the hand comes down on: where on the last link (m), its height over the base's
+            origin (m), and its stiffness (N/m); there is none where that is zero.
     """
 
     kp: Array
@@ -48,6 +50,7 @@ class Servos:
     delay_s: float = 0.003
     feeds_speed: bool = True
     noise_rad: float = 2e-5
+    table: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Body(NamedTuple):
@@ -56,6 +59,7 @@ class Body(NamedTuple):
     frames: Frames
     theta: Array
     base: Array
+    table: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +97,7 @@ def record(
         seed: of the encoders' noise.
     """
     every, late = round(period_s / TICK_S), round(servos.delay_s / TICK_S)
-    body = Body(truth.frames, truth.theta, truth.base)
+    body = Body(truth.frames, truth.theta, truth.base, np.array(servos.table))
     joints = np.array(
         [servos.kp, servos.kd, servos.coulomb, servos.viscous, servos.armature], float
     )
@@ -124,6 +128,8 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
     kp, kd, coulomb, viscous, armature = joints
     n, h, still = len(goal), TICK_S / STEPS, np.zeros(len(goal))
     q, dq, last = at
+    tip = np.eye(4)
+    tip[:3, 3] = body.table[:3]
     inertia = mass_matrix(body.frames, body.theta, q)
     for j in range(n):
         inertia[j, j] += armature[j]
@@ -132,6 +138,9 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
         midway = q + 0.5 * h * dq
         drive = kp * (goal - midway) + kd * (speed - middle) - viscous * middle
         drive -= torques(body.frames, body.theta, body.base, midway, middle, still)
+        if body.table[4] > 0.0:
+            pose, J = end_effector(body.frames, midway, tip)
+            drive += J[2] * body.table[4] * max(body.table[3] - pose[2, 3], 0.0)
         way, rests = np.sign(dq), dq == 0.0
         ddq = np.zeros(n)
         for _ in range(2 * n):  # one joint is let go or held at a time
