@@ -13,12 +13,12 @@ from scipy.interpolate import interp1d
 from scipy.signal import butter, lsim, lti, sosfiltfilt
 
 from adapter.effects.active import active_effects, check_effects
-from adapter.effects.backlash import play
 from adapter.effects.base import Effect, JointTorque, Motion, polar
+from adapter.effects.bodies import parameters_of, theta_of
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import WAYS_RAD, JointSignals, smooth_sign
 from adapter.effects.catalogue import CATALOGUE, LEARNED
-from adapter.effects.payload import parameters_of, theta_of
+from adapter.effects.encoders import play
 from adapter.effects.splits import experiments
 from adapter.effects.torque import ModelTorque, sensed_torque
 from adapter.errors import ModelError
