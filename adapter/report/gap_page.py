@@ -15,8 +15,7 @@ from adapter.gap.result import GapResult, Leftover
 from adapter.model.numbers import DASH, plain
 from adapter.model.robots import names as robot_names
 from adapter.report import gap_tables as tables
-from adapter.report.gap_panels import error_panels
-from adapter.report.gap_signatures import signature_panels, unexplained_panels
+from adapter.report.gap_panels import error_panels, signature_panels, unexplained_panels
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import Step, command
 from adapter.report.tables import Tile

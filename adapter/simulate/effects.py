@@ -32,8 +32,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS, URDF_PLACES
 from adapter.physics.rigid_arm import RigidArm
-from adapter.simulate.bristles import Bristles, with_bristles
-from adapter.simulate.friction import speed_change
+from adapter.simulate.friction import Bristles, speed_change, with_bristles
 
 # What the joints of a file have beside the bodies, by the format's name.
 FORMATS: dict[str, tuple[str, ...]] = {

@@ -13,13 +13,16 @@ import torch
 
 from adapter.errors import ModelError
 from adapter.experiments.baselines.compare import compare, select, validation_part
-from adapter.experiments.baselines.elm import ElmCommittee
 from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
-from adapter.experiments.baselines.gaussian_process import GaussianProcess, negative_log_likelihood
 from adapter.experiments.baselines.lagrangian import DeepLagrangian, MassNetwork, lagrange_torque
 from adapter.experiments.baselines.learner import Baseline, Scale
 from adapter.experiments.baselines.least_squares import RegressorLeastSquares
-from adapter.experiments.baselines.network import FeedForward
+from adapter.experiments.baselines.paper import (
+    ElmCommittee,
+    FeedForward,
+    GaussianProcess,
+    negative_log_likelihood,
+)
 from adapter.experiments.baselines.presets import Choice, learners
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import matrix_from_zxz

@@ -12,7 +12,7 @@ import pytest
 
 from adapter.cli import main
 from adapter.experiments.baselines.compare import Errors, compare
-from adapter.experiments.baselines.elm import ElmCommittee
+from adapter.experiments.baselines.paper import ElmCommittee
 from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.panda import run_panda
 from adapter.experiments.results import LearnerScores

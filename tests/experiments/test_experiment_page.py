@@ -9,9 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapter.experiments.page.atlas_figures import (
+    arm_panels,
+    epoch_panels,
+    histogram_panels,
+    limbs,
+    not_judged,
+    skeleton,
+    whole_panels,
+)
 from adapter.experiments.page.beyond import beyond
-from adapter.experiments.page.figure4 import epoch_panels, histogram_panels, limbs, skeleton
-from adapter.experiments.page.figure5 import arm_panels, not_judged, whole_panels
 from adapter.experiments.page.figure6 import logarithmic, turns_and_shifts
 from adapter.experiments.page.page import render_experiment
 from adapter.experiments.page.words import SETS, headline, scientific, sentences

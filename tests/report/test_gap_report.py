@@ -23,7 +23,7 @@ from adapter.gap.words import (
     sentence,
 )
 from adapter.report.gap_page import render_gap_page, write_gap_page
-from adapter.report.gap_signatures import shown_joints
+from adapter.report.gap_panels import shown_joints
 from adapter.runs.run_folder import RunFolderError
 from tests.helpers import gap_results as made_up
 from tests.helpers.browser import (

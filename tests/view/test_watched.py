@@ -35,9 +35,8 @@ from adapter.runs.pipeline import make_front_end
 from adapter.signals.records import stamp_of
 from adapter.view import foxglove_view
 from adapter.view.foxglove_view import FoxgloveView, free_port
-from adapter.view.messages import Messages, encode
 from adapter.view.now import KnownRun, Now, Onlooker
-from adapter.view.page import LivePage, page_of
+from adapter.view.page import LivePage, Messages, encode, page_of
 from adapter.view.server import address, bind
 from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, tab
 from tests.helpers.live_tools import PANDA, parts, simulated_arm

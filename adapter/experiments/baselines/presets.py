@@ -15,13 +15,11 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
-from adapter.experiments.baselines.elm import MEMBERS, ElmCommittee
 from adapter.experiments.baselines.features import Columns
-from adapter.experiments.baselines.gaussian_process import GaussianProcess
 from adapter.experiments.baselines.lagrangian import DeepLagrangian
 from adapter.experiments.baselines.learner import Baseline
 from adapter.experiments.baselines.least_squares import RegressorLeastSquares
-from adapter.experiments.baselines.network import FeedForward
+from adapter.experiments.baselines.paper import MEMBERS, ElmCommittee, FeedForward, GaussianProcess
 from adapter.model.spatial import Array
 
 Settings = Mapping[str, float]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.page.figure4 import KINDS
+from adapter.experiments.page.atlas_figures import KINDS
 from adapter.experiments.page.words import grouped, scientific, with_unit
 from adapter.experiments.results import AtlasResults, PandaResults
 from adapter.gap.phrases import listed
