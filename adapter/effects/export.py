@@ -17,8 +17,7 @@ from adapter.effects.active import Active, active_effects
 from adapter.model.mjcf import mjcf_onto
 from adapter.model.mjcf_text import MJCF_PLACES, mjcf_text
 from adapter.model.self_model import MJCF, SelfModel, theta_doubt
-from adapter.model.urdf import file_text
-from adapter.model.urdf_onto import urdf_onto
+from adapter.model.urdf import file_text, urdf_onto
 from adapter.model.urdf_text import STIFFNESS, URDF_PLACES, Additions, unplaced, urdf_text
 from adapter.model.xml_edit import XmlText
 

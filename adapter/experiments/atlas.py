@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.baselines import presets
-from adapter.experiments.baselines.compare import Errors, arm_tables, compare
+from adapter.experiments.baselines.compare import Errors, arm_tables, compare, contenders
 from adapter.experiments.baselines.features import Columns, sub_chain, sub_parents
 from adapter.experiments.falls import Falls, gathered, sets_of
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
@@ -263,7 +262,7 @@ def _baselines(
     index = sub_chain(tree, joints, carrier)
     arm = Columns(len(index)), sub_parents(tree, index), source.truth.lam[index]
     sets = arm_tables(source, parts, joints, carrier)
-    return compare(sets, presets.learners(*arm, args.full, args.seed), args.seed, say)
+    return compare(sets, contenders(*arm, args.full, args.seed), args.seed, say)
 
 
 # --- every number of the experiment under a key of its own --------------------------------------

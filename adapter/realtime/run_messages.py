@@ -30,9 +30,8 @@ from adapter.model.spatial import (
 from adapter.model.tree import BASE
 from adapter.model.urdf_text import URDF_PLACES, Additions, urdf_text
 from adapter.physics.identifiability import frame_observability
-from adapter.realtime.loop_board import LoopTiming
 from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader
-from adapter.realtime.timing import COUNTED
+from adapter.realtime.timing import COUNTED, LoopTiming
 from drivers.files.estimates import EstimateNames, estimate_fields
 from drivers.files.mcap.writer import ESTIMATES
 from drivers.files.messages import Message, TransformsEncoder, header

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
-from adapter.report.torque_panels import refusal, theta_started
+from adapter.report.learned_panels import refusal, theta_started
 from adapter.report.words import (
     NARROW,
     capital,

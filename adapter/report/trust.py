@@ -11,7 +11,7 @@ import numpy as np
 from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
 from adapter.report.headline import against
-from adapter.report.torque_panels import SHARE_ALONE, refusal, theta_started
+from adapter.report.learned_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
     NOT_WATCHED,

@@ -17,9 +17,9 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import base_parameters, frame_observability
-from adapter.realtime.loop_board import LoopTiming
 from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot
+from adapter.realtime.timing import LoopTiming
 from adapter.signals.records import StateLayout, stamp_of
 
 ROWS_A_LOOK = 8  # states of which the residual is computed, spread over those since the last look

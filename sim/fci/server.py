@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from sim.ending import Ending, sum_up
 from sim.faults import read_fault
 from sim.fci.clock import Ticks, undisturbed
 from sim.fci.codec import (
@@ -35,6 +34,7 @@ from sim.fci.gripper import GripperServer
 from sim.fci.model import model_library, robot_urdf
 from sim.fci.options import chosen
 from sim.fci.robot import Reporter, Robot
+from sim.options import Ending, sum_up
 from sim.scenarios import Scenario, build
 
 CHUNK = 4096  # bytes at a time; the longest request has 428

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
-from adapter.experiments.baselines.compare import Errors, compare
+from adapter.experiments.baselines.compare import Choice, Errors, compare
 from adapter.experiments.baselines.paper import ElmCommittee
-from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.panda import run_panda
 from adapter.experiments.results import LearnerScores
 from adapter.experiments.split import SETS, split

@@ -23,12 +23,11 @@ from websockets.typing import Subprotocol
 from adapter.cli.display import LiveTable, table_of
 from adapter.control.observer import ContactObserver
 from adapter.learning.settings import LearnerSettings
-from adapter.realtime.loop_board import LoopBoard
 from adapter.realtime.ring import Ring
 from adapter.realtime.session import run_lockstep
 from adapter.realtime.showing import Looker, View
 from adapter.realtime.snapshot import ExternalTorque, SnapshotReader, SnapshotWriter
-from adapter.realtime.timing import Histogram, Timing
+from adapter.realtime.timing import Histogram, LoopBoard, Timing
 from adapter.runs.config import PipelineSettings
 from adapter.runs.live import FIRST_S, Publisher, news_of, single_thread_learner
 from adapter.runs.pipeline import make_front_end

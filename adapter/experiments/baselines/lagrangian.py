@@ -20,9 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from adapter.experiments.baselines.dense import accelerator
 from adapter.experiments.baselines.features import Columns
-from adapter.experiments.baselines.learner import Baseline, Progress, Told
+from adapter.experiments.baselines.learner import Baseline, Progress, Told, accelerator
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.spatial import Array
 from adapter.physics.networks import FrameMotion

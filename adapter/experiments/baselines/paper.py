@@ -8,8 +8,13 @@ import numpy as np
 from scipy import linalg, optimize
 
 from adapter.errors import ModelError
-from adapter.experiments.baselines.dense import gram, solve_positive
-from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
+from adapter.experiments.baselines.learner import (
+    Progress,
+    ScaledBaseline,
+    Told,
+    gram,
+    solve_positive,
+)
 from adapter.model.spatial import Array
 
 NETWORK_UNITS = 1000

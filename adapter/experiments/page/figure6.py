@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from adapter.experiments.results import PandaResults
 from adapter.model.spatial import Array
-from adapter.report.schema_panels import FIRST_S, rotation_path
+from adapter.report.learned_panels import FIRST_S, GROUPS, rotation_path
 from adapter.report.style import (
     ACCENT,
     INK,
@@ -22,7 +22,6 @@ from adapter.report.style import (
     thin,
     time_axis,
 )
-from adapter.report.torque_panels import GROUPS
 from adapter.runs.score import TORQUE_GOAL
 
 EARLY_SHARE = 0.2  # θ's start before this share of the run makes time logarithmic
