@@ -21,8 +21,8 @@ from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
-from adapter.report.headline import headline
 from adapter.report.next_steps import next_steps
+from adapter.report.trust import headline
 from adapter.report.words import NOT_WATCHED, is_live, missed_words, not_learned, small
 from adapter.report.worth import Worth
 from adapter.runs.outcome import Outcome

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import DecidingExperiment
+from adapter.effects.phrases import DecidingExperiment, Phrase
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import NO_PLACE, Additions

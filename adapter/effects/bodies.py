@@ -20,8 +20,7 @@ from adapter.effects.base import (
     Values,
 )
 from adapter.effects.by_joint import ByJoint
-from adapter.effects.phrases import Length, Phrase
-from adapter.effects.splits import ALONE, BARE, LEVELLED, LOADS, WEIGHED
+from adapter.effects.phrases import ALONE, BARE, LEVELLED, LOADS, WEIGHED, Length, Phrase
 from adapter.model.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
 from adapter.model.spatial import exp_rotation
 from adapter.model.urdf_text import NO_PLACE, Additions

@@ -23,8 +23,7 @@ from adapter.effects.base import (
     on_joint,
 )
 from adapter.effects.by_joint import WAYS_RAD, shares_of_ways, smooth_sign
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import SPEEDS, STILL, TURNS
+from adapter.effects.phrases import SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import FRICTION, Additions
 
 USUAL_RAD, TIMES = 1.5e-3, 3.0  # and by what factor it is off: a real Panda, a KUKA LWR4

@@ -18,8 +18,7 @@ from adapter.effects.base import (
     polar,
 )
 from adapter.effects.by_joint import ByJoint, smooth_sign
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import FLANK, LOADS, TURN
+from adapter.effects.phrases import FLANK, LOADS, TURN, Phrase
 from adapter.model.urdf_text import Additions
 
 

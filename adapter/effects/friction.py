@@ -20,8 +20,7 @@ from adapter.effects.base import (
     Values,
     on_joint,
 )
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import BOTH_WAYS, LATER, LOADS, SPEEDS, STILL, TURNS
+from adapter.effects.phrases import BOTH_WAYS, LATER, LOADS, SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import DAMPING, FRICTION, Additions
 
 

@@ -19,8 +19,7 @@ from adapter.effects.base import (
     polar,
 )
 from adapter.effects.law import LOG_ODDS
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import SPEEDS, STILL, TURN
+from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
 from adapter.model.urdf_text import ARMATURE, STIFFNESS, Additions
 
 

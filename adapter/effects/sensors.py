@@ -19,8 +19,7 @@ from adapter.effects.base import (
     Values,
 )
 from adapter.effects.by_joint import ByJoint, JointSignals
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import KNOWN_WEIGHT, LOADS, SPEEDS, STILL, SWINGS
+from adapter.effects.phrases import KNOWN_WEIGHT, LOADS, SPEEDS, STILL, SWINGS, Phrase
 
 LATEST_S = 0.012  # a bus, a filter and a hold together are faster
 

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from adapter.control.controller import ExcitationController
-from adapter.realtime.clock import Clock
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
-from adapter.realtime.real_time import DEFAULT_PRIORITY, RealTime, split_cores
+from adapter.realtime.real_time import DEFAULT_PRIORITY, Clock, RealTime, split_cores
 from adapter.realtime.session import Ended, Session, stop_arm
 from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport

@@ -11,12 +11,11 @@ import numpy as np
 from adapter.gap.monitor_judge import sentence
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report import learned_panels, tables, words
-from adapter.report.headline import against, headline
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import next_steps
 from adapter.report.skeleton import has_reference, skeleton_panels
 from adapter.report.style import ACCENT, JOINT_COLORS, Drawing, Panel, time_axis
-from adapter.report.trust import checks
+from adapter.report.trust import against, checks, headline
 from adapter.report.worth import Worth, worth_panels, worth_table
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL

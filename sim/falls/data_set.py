@@ -26,8 +26,7 @@ import numpy as np
 import pybullet as bullet
 
 from sim.falls import fall
-from sim.falls.fall import RATE_HZ, FallRecord, babble
-from sim.falls.tree_truth import TreeLimits, TreeTruth, atlas
+from sim.falls.fall import RATE_HZ, FallRecord, TreeLimits, TreeTruth, atlas, babble
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A

@@ -25,7 +25,7 @@ from adapter.learning.tree_data import TreeData
 from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_zxz
 from sim.falls.data_set import data_set
-from sim.falls.tree_truth import TreeLimits, TreeTruth
+from sim.falls.fall import TreeLimits, TreeTruth
 from tests.helpers.benchmark import Row, options, write
 
 

@@ -8,7 +8,7 @@ import pytest
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.control.sweeps import HOLD_S, MOVES, RATES, SweepMotion
-from adapter.effects.splits import BOTH_WAYS, SPEEDS, STILL, TURN, TURNS
+from adapter.effects.phrases import BOTH_WAYS, SPEEDS, STILL, TURN, TURNS
 from adapter.errors import SettingsError
 from adapter.model.robots import documented
 from sim.scenarios import build

@@ -19,7 +19,7 @@ from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import WAYS_RAD, JointSignals, smooth_sign
 from adapter.effects.catalogue import CATALOGUE, LEARNED
 from adapter.effects.encoders import play
-from adapter.effects.splits import experiments
+from adapter.effects.phrases import experiments
 from adapter.effects.torque import ModelTorque, sensed_torque
 from adapter.errors import ModelError
 from adapter.model.robots import documented

@@ -11,8 +11,7 @@ import pytest
 from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.catalogue import CATALOGUE, registered
 from adapter.effects.export import robot_urdf, to_urdf
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import SPEEDS, experiments
+from adapter.effects.phrases import SPEEDS, Phrase, experiments
 from adapter.gap.words import headline
 from adapter.gap.workflow import find_gap
 from adapter.model.self_model import SelfModel

@@ -11,7 +11,7 @@ from drivers.damiao import holding
 from drivers.fci import torque_control
 from drivers.interface import Driver
 from drivers.pybullet_arm import PyBulletArm
-from sim.obstacles import Obstacles
+from sim.joint_effects import Obstacles
 from sim.scenarios import Scenario
 from tests.helpers.can_lockstep import on_line
 from tests.helpers.fci_lockstep import FciLockstep

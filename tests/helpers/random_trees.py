@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.falls.tree_truth import BASE, TreeLimits, TreeTruth
+from sim.falls.fall import BASE, TreeLimits, TreeTruth
 from sim.truth import Array, theta_of, turn
 
 GRAVITY = (0.0, 0.0, -9.81)  # m/s², world axes

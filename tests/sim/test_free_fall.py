@@ -9,8 +9,7 @@ import pinocchio as pin
 import pytest
 
 from adapter.model.spatial import matrix_from_zxz
-from sim.falls.fall import TOP_SPEED, FallRecord, babble
-from sim.falls.tree_truth import TreeTruth, atlas
+from sim.falls.fall import TOP_SPEED, FallRecord, TreeTruth, atlas, babble
 from sim.truth import body_of
 from tests.helpers.random_trees import random_tree
 from tests.helpers.robot_models import read_quietly, shared

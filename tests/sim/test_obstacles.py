@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.dynamics import end_effector
-from sim.obstacles import Obstacles
+from sim.joint_effects import Obstacles
 from sim.options import check
 from sim.scenarios import build
 from sim.truth import FLANGE

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import butter, sosfreqz
 
 from adapter.model.robots import documented as known
-from adapter.model.robots.known import facts_of as facts_about
+from adapter.model.robots import facts_of as facts_about
 from drivers.interface import JointSample
 from sim.effects import effect_from
 from sim.noise import BAND_HZ, RATE_HZ, SensorNoise, band_response, levels_of
