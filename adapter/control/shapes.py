@@ -29,9 +29,9 @@ from adapter.model.locking import LOCKED
 from adapter.model.robot_file import Merged
 from adapter.model.robots import facts_of
 from adapter.model.self_model import URDF, SelfModel, Source
-from adapter.model.spatial import Array, matrix_from_rpy
+from adapter.model.spatial import Array
 from adapter.model.tree import BASE
-from adapter.model.urdf import parse_urdf
+from adapter.model.urdf import origin_of, parse_urdf
 from drivers.files.bounded import read_bytes
 
 FORMATS = ".stl, .obj"
@@ -288,9 +288,8 @@ def _of_collisions(model: SelfModel) -> tuple[list[Body], set[int]]:
         body, R_link, p_link = merged.place[link.get("name", "")]
         for collision in link.findall("collision"):
             shape = collision.find("geometry/*")
-            origin = collision.find("origin")
-            place = np.zeros(6) if origin is None else _six(origin)
-            R, p = R_link @ matrix_from_rpy(place[3:]), p_link + R_link @ place[:3]
+            turn, place = origin_of(collision, f"{source.file}: <collision>")
+            R, p = R_link @ turn, p_link + R_link @ place
             line = None if shape is None else _line_of(shape)
             if line is not None:
                 ends = np.array([p - R @ line[0], p + R @ line[0]])
@@ -321,11 +320,6 @@ def _mesh_of(shape: ET.Element, source: Source, link: str) -> Mesh | None:
             stacklevel=2,
         )
         return None
-
-
-def _six(origin: ET.Element) -> Array:
-    texts = origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0")
-    return np.array([float(part) for text in texts for part in text.split()])
 
 
 def _line_of(shape: ET.Element) -> tuple[Array, float] | None:

@@ -63,7 +63,12 @@ class TorqueRipple(JointTorque):
 
     def templates(self) -> tuple[Template, ...]:
         """Sine and cosine of each number per turn."""
-        return tuple(Template((0.3, 0.3), partial(_decode, n), f"n = {n}") for n in NUMBERS)
+        return tuple(Template((0.3, 0.3), partial(self.decode, n=n), f"n = {n}") for n in NUMBERS)
+
+    def decode(self, x: Array, n: int = 1) -> dict[str, Any]:
+        """Of sine and cosine of n turns."""
+        size, phase = polar(x)
+        return {"a": size, "n": float(n), "phase": phase}
 
     def log_odds_over(self, values: Values, turned: float) -> float:
         """Less than a whole wave may be any curve over the angle, which has no name."""
@@ -72,11 +77,6 @@ class TorqueRipple(JointTorque):
     def law(self, at: JointSignals, values: Values) -> Array:
         """a sin(n q + phase)."""
         return np.asarray(values["a"] * np.sin(values["n"] * at.q + values["phase"]))
-
-
-def _decode(n: int, x: Array) -> dict[str, Any]:
-    size, phase = polar(x)
-    return {"a": size, "n": float(n), "phase": phase}
 
 
 # Farther from zero no joint's spring rests, unless it is at zero but for an offset so small

@@ -148,11 +148,6 @@ SPLITS = (
 )
 
 
-def split_of(one: Shown, other: Shown) -> DecidingExperiment | None:
-    """The experiment that tells two effects apart; None where none of them does."""
-    return next((s for s in SPLITS if shown(one, s) != shown(other, s)), None)
-
-
 def shown(effect: Shown, split: DecidingExperiment) -> str:
     """What an effect shows in an experiment."""
     return dict(effect.shows).get(split, split.untouched)
@@ -165,7 +160,7 @@ def experiments(effect: Shown, rivals: Iterable[Shown]) -> tuple[str, ...]:
     """
     by_split: dict[DecidingExperiment, list[Shown]] = {}
     for rival in rivals:
-        split = split_of(effect, rival)
+        split = next((s for s in SPLITS if shown(effect, s) != shown(rival, s)), None)
         if split is not None:
             by_split.setdefault(split, []).append(rival)
     return tuple(

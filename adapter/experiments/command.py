@@ -11,9 +11,10 @@ import numpy as np
 from rich.table import Table
 
 from adapter.experiments.atlas import run_atlas
-from adapter.experiments.page.page import write_experiment
+from adapter.experiments.page.page import render_experiment
 from adapter.experiments.panda import run_panda
 from adapter.experiments.results import AtlasResults, PandaResults, Stated
+from adapter.report.html import write_whole
 from adapter.runs.terminal import (
     json_ready,
     output,
@@ -53,7 +54,7 @@ def _write(
         if results is not None
     }
     written = f"panda-adapter {program_version()}, seed {args.seed}"
-    write_experiment(folder / PAGE, atlas, panda, written)
+    write_whole(folder / PAGE, render_experiment(atlas, panda, written))
     write_json(folder / "experiment.json", figures)
     write_json(args.json, figures)
 

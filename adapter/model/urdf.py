@@ -139,7 +139,7 @@ def _number(element: ET.Element, key: str, where: str) -> float:
     return float(_numbers(value, 1, f"{where}, <{element.tag} {key}>")[0])
 
 
-def _origin(element: ET.Element, where: str) -> tuple[Array, Array]:
+def origin_of(element: ET.Element, where: str) -> tuple[Array, Array]:
     """Rotation (3, 3) and position (3,) of an <origin>; the identity where there is none."""
     origin = element.find("origin")
     if origin is None:
@@ -162,7 +162,7 @@ def _link_theta(element: ET.Element, where: str) -> Array:
     if kilograms < 0:
         raise ModelError(f"{where} has a negative mass of {kilograms} kg")
     about_com = tensor_from_six([_number(tensor, key, where) for key in _SIX])
-    rotation, com = _origin(inertial, where)
+    rotation, com = origin_of(inertial, where)
     return move_theta(theta_from_body(kilograms, np.zeros(3), about_com), rotation, com)
 
 
@@ -181,7 +181,7 @@ def _joint(element: ET.Element, links: dict[str, Array], file: str) -> FileJoint
         if link not in links:
             raise ModelError(f"{where} names {end} '{link}'; have links: {', '.join(links)}")
         ends[end] = link
-    rotation, position = _origin(element, where)
+    rotation, position = origin_of(element, where)
     axis = _axis(element, where) if kind in (*TURNING, *SLIDING) else np.array([1.0, 0.0, 0.0])
     limits, followed, mimic = _limits(element, kind, where), element.find("mimic"), None
     if followed is not None:

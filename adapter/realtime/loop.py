@@ -19,7 +19,7 @@ import numpy as np
 from adapter.control.controller import ExcitationController
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
-from adapter.realtime.real_time import DEFAULT_PRIORITY, Clock, RealTime, split_cores
+from adapter.realtime.real_time import Clock, RealTime, split_cores
 from adapter.realtime.session import Ended, Session, stop_arm
 from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
@@ -39,8 +39,6 @@ class LiveOptions:
 
     Attributes:
         duration_s: until the safe stop begins; None runs until somebody stops it.
-        priority: of SCHED_FIFO; None stays ordinary.
-        lock_memory: whether to ask for it.
         deadman: stop safely as well when the operator's terminal or the parent process is gone.
         shared_memory: sizes and names.
         before_motion: called once the motion is drawn (the controller knows it) and before the
@@ -50,8 +48,6 @@ class LiveOptions:
     """
 
     duration_s: float | None = None
-    priority: int | None = DEFAULT_PRIORITY
-    lock_memory: bool = True
     deadman: bool = False
     shared_memory: SharedMemoryOptions = field(default_factory=SharedMemoryOptions)
     before_motion: Callable[[Callable[[], bool]], None] | None = None
@@ -200,7 +196,7 @@ def run_live(
         supervisor.start(cancelled=lambda: stop.count > 0)
         stack.callback(driver.close)
         driver.connect()
-        real_time = RealTime(min(split_cores()[0]), options.priority, options.lock_memory)
+        real_time = RealTime(min(split_cores()[0]))
         session = None
         try:
             session = Session(

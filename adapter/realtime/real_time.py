@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
 MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
-DEFAULT_PRIORITY = 70  # above the kernel's interrupt threads (50), below its watchdogs (99)
+PRIORITY = 70  # of SCHED_FIFO: above the kernel's interrupt threads (50), below its watchdogs (99)
 
 
 # One clear sentence on a request, and what takes back what was granted; None where nothing was.
@@ -33,42 +33,26 @@ class RealTime:
     """Asks on entry, gives everything back on exit. For the thread that runs the loop.
 
     Args:
-        core: the loop's core; None leaves the scheduler its choice.
-        priority: of SCHED_FIFO, 1 to 99; None does not ask.
-        lock: whether to lock memory.
+        core: the loop's.
 
     Attributes:
         grants: the answers' sentences, in order.
     """
 
-    def __init__(
-        self,
-        core: int | None = None,
-        priority: int | None = DEFAULT_PRIORITY,
-        lock: bool = True,
-    ) -> None:
-        self._core, self._priority, self._lock = core, priority, lock
-        self._undo = ExitStack()
+    def __init__(self, core: int) -> None:
+        self._core, self._undo = core, ExitStack()
         self.grants: list[str] = []
 
     def __enter__(self) -> RealTime:
-        self._ask(quiet_collector())
-        if self._lock:
-            self._ask(lock_memory())
-        if self._core is not None:
-            self._ask(pin({self._core}))
-        if self._priority is not None:
-            self._ask(request_fifo(self._priority))
+        for answer in (quiet_collector(), lock_memory(), pin({self._core}), request_fifo(PRIORITY)):
+            line, undo = answer
+            self.grants.append(line)
+            if undo is not None:
+                self._undo.callback(undo)
         return self
 
     def __exit__(self, *error: object) -> None:
         self._undo.close()
-
-    def _ask(self, answer: Answer) -> None:
-        line, undo = answer
-        self.grants.append(line)
-        if undo is not None:
-            self._undo.callback(undo)
 
 
 def request_fifo(priority: int) -> Answer:

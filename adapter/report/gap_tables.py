@@ -43,12 +43,8 @@ class FindingRow:
     worth: str
 
 
-def finding_rows(result: GapResult) -> list[FindingRow]:
+def finding_row(findings: Sequence[Finding]) -> FindingRow:
     """What, where, when, how much, how sure: one row for what is the same on several joints."""
-    return [_row(findings) for findings in by_kind(result.findings)]
-
-
-def _row(findings: Sequence[Finding]) -> FindingRow:
     first = findings[0]
     ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
     joints = sorted({j for f in ordered for j in f.joints})

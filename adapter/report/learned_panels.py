@@ -212,13 +212,11 @@ def _finish(drawing: Drawing, t: Array, data: RunData) -> None:
     time_axis(drawing)
 
 
-def prequential_panels(data: RunData) -> list[Panel]:
-    """Torque error of each sample before it was learned from, against batch least squares."""
-    return [_against_batch(data), _by_joint(data)]
+def error_panel(data: RunData) -> Panel:
+    """Torque error of each sample before it was learned from, against batch least squares.
 
-
-def _against_batch(data: RunData) -> Panel:
-    """In units of each joint's noise, as convergence is judged; up to the first change."""
+    In units of each joint's noise, as convergence is judged; up to the first change.
+    """
     t = data.times(data.score_trace)
     _, _, _, tau, error = data.score_signals()
     changes = change_times(data)
@@ -246,7 +244,8 @@ def _against_batch(data: RunData) -> Panel:
     )
 
 
-def _by_joint(data: RunData) -> Panel:
+def error_by_joint(data: RunData) -> Panel:
+    """The same of each joint, in N m."""
     t = data.times(data.score_trace)
     error = data.score_signals()[4]
     drawing = Drawing("half")

@@ -47,6 +47,7 @@ def context(data: RunData) -> dict[str, Any]:
     figures, started, worth = data.figures, learned_panels.theta_started(data), Worth.of(data)
     fit = data.times(data.score_trace)[learned_panels.fit_window(data)] if started else []
     fault, start_s = figures.get("fault"), figures.get("start_s") or 0.0
+    errors = learned_panels.error_panel, learned_panels.error_by_joint
     ended = [f"The run ended early: {fault}"] if fault else []
     new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
     return {
@@ -72,7 +73,7 @@ def context(data: RunData) -> dict[str, Any]:
         "body_parts": learned_panels.BODY_PARTS,
         "bodies": learned_panels.body_panels(data) if started else [],
         "effects": learned_panels.effect_panels(data) if started else [],
-        "prequential": learned_panels.prequential_panels(data) if started else [],
+        "prequential": [panel(data) for panel in (errors if started else ())],
         "fit": learned_panels.fit_panels(data) if started else [],
         "fit_span": f"{words.number(fit[0])} to {words.quantity(fit[-1], 's')}" if len(fit) else "",
         "joint_tables": tables.joint_tables(data),

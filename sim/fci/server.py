@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import select
 import socket
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,7 +24,6 @@ from sim.fci.codec import (
     RequestReader,
     RobotCommand,
     Status,
-    connect_reply,
     limit_reply,
     read_command,
     reply,
@@ -365,11 +365,11 @@ class FciServer:
         assert session is not None
         if request.name == "Connect":
             wanted, port = request.connect_terms()
-            if wanted != self._says or port == 0:
-                return connect_reply(request, Status.INCOMPATIBLE, version, self._says)
-            if not session.connected:
+            agreed = wanted == self._says and port != 0
+            if agreed and not session.connected:
                 session.begin_states(port)
-            return connect_reply(request, Status.OK, version, self._says)
+            status = Status.OK if agreed else Status.INCOMPATIBLE
+            return reply(request, status, version, struct.pack("<H", self._says))
         if not session.connected:
             raise BadRequest(f"{request.name} before Connect")
         if request.name == "GetCartesianLimit":

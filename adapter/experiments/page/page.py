@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from adapter.experiments.results import AtlasResults, LearnerScores, PandaResult
 from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.numbers import DASH
-from adapter.report.html import fill, write_whole
+from adapter.report.html import fill
 from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW
@@ -41,18 +40,6 @@ def render_experiment(atlas: AtlasResults | None, panda: PandaResults | None, wr
         ValueError: results whose shapes do not fit their tree.
     """
     return fill("experiment.html", context(atlas, panda, written), "adapter.experiments")
-
-
-def write_experiment(
-    path: str | Path, atlas: AtlasResults | None, panda: PandaResults | None, written: str
-) -> Path:
-    """Write the page, whole or not at all. Returns the path. See `render_experiment`.
-
-    Raises:
-        RunFolderError: the file cannot be written.
-        ValueError: results whose shapes do not fit their tree.
-    """
-    return write_whole(path, render_experiment(atlas, panda, written))
 
 
 def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str) -> dict[str, Any]:
