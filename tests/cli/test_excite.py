@@ -13,7 +13,7 @@ from adapter.control.designed import DesignedMotion
 from adapter.control.limits import MotionLimits
 from adapter.effects.phrases import LOADS, SPEEDS
 from adapter.model.robots import documented
-from tests.helpers.ros_readers import by_mcap_ros2
+from tests.helpers.ros_messages import by_mcap_ros2
 
 pytest.importorskip("coal")
 LIMITS = MotionLimits.of(documented("panda"))
