@@ -20,8 +20,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from sim.compiled import compiled
-from sim.dynamics import Frames, end_effector
+from sim.dynamics import Frames, compiled, end_effector
 from sim.effects import MOTION, OBSTACLE, SPECS, Effect
 from sim.truth import FLANGE, Array, Truth
 

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
-from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
+from adapter.effects.robots import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model

@@ -12,10 +12,9 @@ import numpy as np
 
 from adapter.experiments.baselines.compare import Errors, arm_tables, compare, contenders
 from adapter.experiments.baselines.features import Columns, sub_chain, sub_parents
-from adapter.experiments.falls import Falls, gathered, sets_of
+from adapter.experiments.falls import Falls, Split, gathered, sets_of, split
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
 from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
-from adapter.experiments.split import Split, split
 from adapter.experiments.stated import PAPER_BASELINES, atlas_stated
 from adapter.experiments.topology import fall_logs, topology_trials
 from adapter.learning.batch.prediction_errors import (

@@ -24,7 +24,7 @@ import numpy as np
 from adapter.effects.active import Active, active_effects, by_joint, with_bodies
 from adapter.effects.base import BodyEffect, JointTorque, Motion, SensorEffect, TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ, ByJoint, JointSignals, smooth_sign
-from adapter.effects.export import additions
+from adapter.effects.robots import additions
 from adapter.effects.torque import arm_between, moved_links
 from adapter.errors import ModelError, SettingsError
 from adapter.model.mjcf_text import MJCF_PLACES

@@ -16,8 +16,7 @@ import numpy as np
 import pybullet as bullet
 from scipy.spatial.transform import Rotation
 
-from sim.compiled import compiled
-from sim.dynamics import Frames, link_motion
+from sim.dynamics import Frames, compiled, link_motion
 from sim.rigid_bodies import disconnect, load_urdf
 from sim.truth import Array, body_of, facts_of, from_rpy, lam_of, theta_of
 from sim.urdf_writer import joint_text, link_text, principal

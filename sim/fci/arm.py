@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.interface import DriverError, JointSample
-from sim.compiled import compiled
-from sim.dynamics import cross, end_effector
+from sim.dynamics import compiled, cross, end_effector
 from sim.effects import payload
 from sim.fci.cartesian import difference, impedance, posture
 from sim.fci.codec import JOINTS, TICK_S, Request, Status

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.compiled import compiled
-from sim.dynamics import Frames, cross, end_effector
+from sim.dynamics import Frames, compiled, cross, end_effector
 from sim.fci.codec import TICK_S, Generator, RobotCommand
 from sim.truth import Array, Limits, turn_about
 

@@ -28,11 +28,10 @@ from sim.fci.codec import (
     read_command,
     reply,
 )
-from sim.fci.faults import KINDS, Spoiler
+from sim.fci.faults import KINDS, Spoiler, chosen
 from sim.fci.gripper import PORT as GRIPPER_PORT
 from sim.fci.gripper import GripperServer
 from sim.fci.model import model_library, robot_urdf
-from sim.fci.options import chosen
 from sim.fci.robot import Reporter, Robot
 from sim.options import Ending, sum_up
 from sim.scenarios import Scenario, build

@@ -19,7 +19,7 @@ from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.push_bound import PushBound, left_at_most, push_bound
 from adapter.control.settings import ExcitationSettings, SafetySettings
-from adapter.effects.export import to_urdf
+from adapter.effects.robots import to_urdf
 from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from drivers.interface import JointSample

@@ -24,10 +24,10 @@ from adapter.effects.active import active_effects, by_joint
 from adapter.effects.base import Array, LinearEffect, Parameter, Values
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE, registered
-from adapter.effects.export import robot_urdf, to_urdf
 from adapter.effects.kept import keep, read_kept, with_kept
 from adapter.effects.law import CURVES, LAWS, Curve, Law, splines
 from adapter.effects.phrases import SPEEDS, Phrase, experiments
+from adapter.effects.robots import robot_urdf, to_urdf
 from adapter.errors import ModelError, SettingsError
 from adapter.gap.result import GapResult
 from adapter.gap.words import as_json, headline

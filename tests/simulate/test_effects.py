@@ -13,7 +13,7 @@ import pinocchio as pin
 import pybullet
 import pytest
 
-from adapter.effects.export import additions, robot_mjcf, to_urdf
+from adapter.effects.robots import additions, robot_mjcf, to_urdf
 from adapter.errors import MeansError, ModelError, SettingsError
 from adapter.model.mjcf_text import MJCF_PLACES, joint_attributes
 from adapter.model.self_model import SelfModel

@@ -23,9 +23,8 @@ from adapter.experiments.baselines.lagrangian import DeepLagrangian
 from adapter.experiments.baselines.learner import Baseline
 from adapter.experiments.baselines.least_squares import RegressorLeastSquares
 from adapter.experiments.baselines.paper import MEMBERS, ElmCommittee, FeedForward, GaussianProcess
-from adapter.experiments.falls import Falls, sets_of
+from adapter.experiments.falls import SETS, TRAIN_SHARE, Falls, Split, sets_of
 from adapter.experiments.results import BOX_PERCENTILES, LearnerScores
-from adapter.experiments.split import SETS, TRAIN_SHARE, Split
 from adapter.learning.batch.prediction_errors import relative_errors
 from adapter.model.spatial import Array
 
