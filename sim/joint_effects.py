@@ -193,7 +193,6 @@ def step(M: Array, bias: Array, v: Array, h: float, parts: Array, drive: Array) 
 # Our choice: a joint gives 0.02 rad to 100 N m, a wall 5 mm to 100 N.
 HOLD_STIFFNESS, HOLD_DAMPING = 5000.0, 50.0  # N m/rad, N m s/rad
 WALL_STIFFNESS, WALL_DAMPING = 20000.0, 200.0  # N/m, N s/m
-GRIP = 0.5  # friction of the floor
 
 
 class Obstacles:
@@ -259,7 +258,7 @@ class Obstacles:
         touched, _ = self._places.setdefault(k, (hand.copy(), 0.0))
         push = WALL_STIFFNESS * (touched - hand) - WALL_DAMPING * speed
         push[2] = max(WALL_STIFFNESS * depth - WALL_DAMPING * speed[2], 0.0)
-        side, most = float(np.hypot(*push[:2])), GRIP * push[2]
+        side, most = float(np.hypot(*push[:2])), 0.5 * push[2]  # friction of the floor
         if side > most:  # it slides, and what it holds on to comes along
             push[:2] *= most / side
             touched[:2] = hand[:2] + push[:2] / WALL_STIFFNESS

@@ -32,7 +32,6 @@ Flags = NDArray[np.bool_]
 Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-FEWEST_TO_FILTER = 100  # instants
 SMOOTH_HZ = 10.0  # low-pass of motions whose torques are compared as they are
 RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
 EVEN, PAUSE_STEPS = 1e-3, 10  # share of a step by which even ones differ; most that a pause is
@@ -181,7 +180,7 @@ class Motion:
 
     def _evenly(self, x: Array, made: Callable[[Array, float], Array]) -> Array:
         """A signal x (m,) as a filter makes it of even samples and their step (s)."""
-        if self.apart or len(x) < FEWEST_TO_FILTER:
+        if self.apart or len(x) < 100:  # instants
             return x
         steps = np.diff(self.t)
         step = float(np.median(steps))

@@ -35,7 +35,6 @@ from adapter.runs.outcome import frame_errors
 from adapter.runs.terminal import console
 from sim.falls.data_set import Flight, data_set
 
-ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
 
@@ -208,7 +207,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     if not args.no_baselines:
         learners += _baselines(args, source, parts, say)
     say("learning online, sample by sample")
-    used = [k for k in range(count) if k not in parts.control][:ONLINE_FALLS]
+    used = [k for k in range(count) if k not in parts.control][:3]  # 30 s in all
     motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
     online, _ = online_trial(motions, source.exact(parts.control[0]), truth.lam)
     say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")

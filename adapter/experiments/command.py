@@ -39,7 +39,6 @@ from adapter.runs.terminal import (
 )
 from sim.scenarios import build
 
-PANDA_S = 40.0  # of motion; the paper's λ needs as long
 PAGE = "experiment.html"
 
 
@@ -53,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
             atlas = run_atlas(args)
             print_stated("ATLAS, section IV.A", atlas.stated)
         else:
-            panda = run_panda(args.seed, PANDA_S, args.seeds)
+            panda = run_panda(args.seed, 40.0, args.seeds)  # the paper's λ needs as long
             print_stated("Panda, section IV.B", panda.stated)
         _write(args, folder, atlas, panda)
     show(f"report {folder / PAGE}")

@@ -18,12 +18,11 @@ from adapter.model.onto import SAME, changes_onto
 from adapter.model.robot_file import SLIDING, TURNING, FileJoint, FileRobot, Merged
 from adapter.model.self_model import LIMITS, URDF, SelfModel, Source, check_limits, gravity_down
 from adapter.model.spatial import Array, matrix_from_rpy, rpy_from_matrix, vector3
-from adapter.model.urdf_text import NO_INERTIA, Additions, number_text, six_named
+from adapter.model.urdf_text import NO_INERTIA, SIX, Additions, number_text, six_named
 from adapter.model.xml_edit import Element, XmlText
 from drivers.files.bounded import read_text
 
 JOINT_TYPES = (*TURNING, "fixed", "prismatic", "planar", "floating")
-_SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def read_urdf(
@@ -161,7 +160,7 @@ def _link_theta(element: ET.Element, where: str) -> Array:
     kilograms = _number(mass, "value", where)
     if kilograms < 0:
         raise ModelError(f"{where} has a negative mass of {kilograms} kg")
-    about_com = tensor_from_six([_number(tensor, key, where) for key in _SIX])
+    about_com = tensor_from_six([_number(tensor, key, where) for key in SIX])
     rotation, com = origin_of(inertial, where)
     return move_theta(theta_from_body(kilograms, np.zeros(3), about_com), rotation, com)
 

@@ -129,17 +129,14 @@ class Deadman:
 
     The operator is gone when the terminal was closed, or the program that started this one ended.
     Where standard input is no terminal (a service, a pipe), the parent process alone is watched.
-
-    Args:
-        terminal: file descriptor of the operator's terminal.
     """
 
-    def __init__(self, terminal: int = 0) -> None:
+    def __init__(self) -> None:
         self._parent = os.getppid()
         self._poll: select.poll | None = None
-        if os.isatty(terminal):
+        if os.isatty(0):
             self._poll = select.poll()
-            self._poll.register(terminal, 0)  # a hang-up is told without being asked for
+            self._poll.register(0, 0)  # a hang-up is told without being asked for
 
     def gone(self) -> bool:
         """Whether nobody is there to stop the arm any more."""

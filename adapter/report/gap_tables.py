@@ -17,9 +17,6 @@ from adapter.model.spatial import Array
 from adapter.report.tables import Table
 from adapter.report.words import NARROW, capital
 
-MOST_CORRECTIONS = 6
-
-
 UNIT = re.compile(
     r"(?<=\d) (N m s/rad|N m/rad|N m/s|N m|kg m²|kg m|kg|N|mrad|rad|mm|ms|s|%)(?![\w²])"
 )
@@ -213,7 +210,7 @@ def correction_table(result: GapResult) -> Table | None:
     if ratio is None or result.corrections is None or result.corrections_prior is None:
         return None
     rows = []
-    for place in np.argsort(-np.abs(ratio), axis=None)[:MOST_CORRECTIONS]:
+    for place in np.argsort(-np.abs(ratio), axis=None)[:6]:
         link, part = np.unravel_index(place, ratio.shape)
         if ratio[link, part] == 0.0:
             break

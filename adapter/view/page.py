@@ -38,7 +38,6 @@ from adapter.view.now import KnownRun, Now, Onlooker
 from adapter.view.server import ViewServer
 
 PERIOD_S = 0.05  # between two frames
-HISTORY_EVERY = 20  # frames; for pages that come
 DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimated
 ESTIMATE_S = 0.5
 FAST_ROWS, SLOW_ROWS = 400, 240  # kept of the past, for a page that comes late or comes back
@@ -48,7 +47,6 @@ LAMBDA = (
     *((f"shift along {axis}", "mm") for axis in "xyz"),
 )
 RECENT = ("t", "residual", "noise")  # of a frame, that a page gets of the past
-TIMED = ("loop_us", "lateness_us")
 Message = dict[str, Any]
 
 
@@ -201,7 +199,7 @@ class Messages:
         assert timing is not None and lately is not None
         told: Message = {"missed": timing.missed, "missed_own": timing.missed_own}
         told["missed_lately"] = lately.missed
-        for what in TIMED:
+        for what in ("loop_us", "lateness_us"):
             whole, late = timing.of(what), lately.of(what)
             told[what] = {
                 "count": whole.count,
@@ -293,7 +291,7 @@ class LivePage:
     def __call__(self, now: Now) -> None:
         """Take what is to be seen now; waits for nobody."""
         due = {kind: encode(message) for kind, message in self._messages.take(now).items()}
-        if now.view.done or self._frames % HISTORY_EVERY == 0:
+        if now.view.done or self._frames % 20 == 0:  # for pages that come
             due["history"] = self._messages.history()
         self._frames += 1
         self._server.newest.put(due)

@@ -46,8 +46,6 @@ KINDS = {
     "clock": Kind("message ids jump by so many", COUNT, "10000"),
     "version": Kind("the server says that it speaks this version", VERSION, "7", timed=False),
 }
-LATEST_TICKS = 5
-FLIPPED_BYTES = 8  # at most
 SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
 JUMP_RAD = 0.05
 OF_DATAGRAMS = ("drop", "late", "repeat", "reorder", "corrupt")
@@ -132,7 +130,7 @@ class Spoiler:
                 self._held, copies = copies[0], []
             else:
                 if fault.name == "late":
-                    when = tick + int(self._rng.integers(1, LATEST_TICKS + 1))
+                    when = tick + int(self._rng.integers(1, 6))
                     self._later.extend((when, item) for item in copies)
                 copies = []
         return copies
@@ -141,7 +139,7 @@ class Spoiler:
         if self._rng.random() < 0.5:
             return data[: self._rng.integers(len(data))]
         changed = bytearray(data)
-        for at in self._rng.integers(len(data), size=self._rng.integers(1, FLIPPED_BYTES + 1)):
+        for at in self._rng.integers(len(data), size=self._rng.integers(1, 9)):
             changed[at] ^= int(self._rng.integers(1, 256))
         return bytes(changed)
 

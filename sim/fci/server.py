@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import select
 import socket
 import struct
@@ -41,7 +42,6 @@ MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it i
 QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
 IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
 IDLE_WITH_HAND_S = 0.01
-HAND_TICKS = 10  # between two looks at the gripper's client
 
 
 class ClientSession:
@@ -253,7 +253,7 @@ class FciServer:
                     if not self._session.open:
                         self._drop()
                 self._accept()
-                if self.hand is not None and self._tick % HAND_TICKS == 0:
+                if self.hand is not None and self._tick % 10 == 0:
                     self.hand.poll()
 
     def summary(self) -> dict[str, Any]:
@@ -420,4 +420,5 @@ def _hand(args: argparse.Namespace) -> GripperServer | None:
 
 
 def _taken(port: int, error: OSError) -> str:
-    return f"port {port} of {HOST} cannot be used ({error.strerror}); stop what uses it"
+    why = os.strerror(error.errno or 0)
+    return f"port {port} of {HOST} cannot be used ({why}); stop what uses it"

@@ -12,6 +12,12 @@ import pytest
 import torch
 
 from adapter.errors import ModelError
+from adapter.experiments.baselines.by_physics import (
+    DeepLagrangian,
+    MassNetwork,
+    RegressorLeastSquares,
+    lagrange_torque,
+)
 from adapter.experiments.baselines.compare import (
     Choice,
     compare,
@@ -20,9 +26,7 @@ from adapter.experiments.baselines.compare import (
     validation_part,
 )
 from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
-from adapter.experiments.baselines.lagrangian import DeepLagrangian, MassNetwork, lagrange_torque
 from adapter.experiments.baselines.learner import Baseline, Scale
-from adapter.experiments.baselines.least_squares import RegressorLeastSquares
 from adapter.experiments.baselines.paper import (
     ElmCommittee,
     FeedForward,

@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from adapter.experiments.baselines.by_physics import DeepLagrangian, RegressorLeastSquares
 from adapter.experiments.baselines.features import Columns, arm_problem
-from adapter.experiments.baselines.lagrangian import DeepLagrangian
 from adapter.experiments.baselines.learner import Baseline
-from adapter.experiments.baselines.least_squares import RegressorLeastSquares
 from adapter.experiments.baselines.paper import MEMBERS, ElmCommittee, FeedForward, GaussianProcess
 from adapter.experiments.falls import SETS, TRAIN_SHARE, Falls, Split, sets_of
 from adapter.experiments.results import BOX_PERCENTILES, LearnerScores

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
 from adapter.experiments.page.words import OURS, SETS, baselines, fopnet, grouped, letter, with_unit
-from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
+from adapter.experiments.results import AtlasResults, LearnerScores
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
@@ -110,14 +110,7 @@ def _name(joints: Sequence[str]) -> str:
 
 
 def skeleton(tree: Tree, lam: Array) -> Skeleton:
-    """Joint origins and axes in the base's frame, all joint angles zero, of λ (n, 6).
-
-    Raises:
-        ValueError: λ of another shape, or not finite.
-    """
-    lam = np.asarray(lam, dtype=float)
-    if lam.shape != (tree.n, 6) or not np.isfinite(lam).all():
-        raise ValueError(f"a skeleton needs finite λ ({tree.n}, 6), got shape {lam.shape}")
+    """Joint origins and axes in the base's frame, all joint angles zero, of λ (n, 6)."""
     return skeleton_of(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:], np.zeros(tree.n))
 
 
@@ -185,11 +178,7 @@ def fit_to(drawing: Drawing, shown: Sequence[Skeleton]) -> None:
 
 
 def histogram_panels(atlas: AtlasResults) -> tuple[Panel | None, Panel | None]:
-    """Kinematic errors of the networks' λ (Fig. 4f) and of the moments'; None without any.
-
-    Raises:
-        ValueError: counts that do not fit the edges.
-    """
+    """Kinematic errors of the networks' λ (Fig. 4f) and of the moments'; None without any."""
     error = "errors |k − k̂|"
     samples = atlas.numbers.get("learned_samples")
     on = "the samples" if samples is None else f"the {grouped(samples)} samples"
@@ -214,11 +203,7 @@ def _histogram(
 ) -> Panel | None:
     """How large the kinematic errors are, by kind."""
     edges = np.asarray(log_edges, dtype=float)
-    counts = {kind: np.asarray(c, dtype=float) for kind, c in by_kind.items()}
-    for kind, values in counts.items():
-        if len(values) != len(edges) - 1:
-            raise ValueError(f"{len(edges)} edges need {len(edges) - 1} counts of '{kind}'")
-    counts = {kind: values for kind, values in counts.items() if values.sum() > 0.0}
+    counts = {kind: np.asarray(c, float) for kind, c in by_kind.items() if sum(c) > 0.0}
     if not counts:
         return None
     drawing = Drawing("third", stretch=STRETCH)
@@ -300,25 +285,10 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
 
 
 def arm_rows(atlas: AtlasResults, learner: LearnerScores) -> dict[str, Array]:
-    """By set the boxes (arm joints, 5) of a learner of the whole tree or of the arm alone.
-
-    Raises:
-        ValueError: boxes of another number of joints or percentiles.
-    """
-    found = {}
-    for name in SETS:
-        if name not in learner.boxes:
-            continue
-        boxes = np.asarray(learner.boxes[name], dtype=float)
-        wanted = {(joints, len(BOX_PERCENTILES)) for joints in (atlas.tree.n, len(atlas.arm))}
-        if boxes.shape not in wanted:
-            raise ValueError(
-                f"{learner.name}, {name}: boxes have shape {boxes.shape}; have: "
-                + " or ".join(map(str, sorted(wanted)))
-            )
-        whole = len(boxes) == atlas.tree.n
-        found[name] = boxes[list(atlas.arm)] if whole else boxes
-    return found
+    """By set the boxes (arm joints, 5) of a learner of the whole tree or of the arm alone."""
+    boxes = {name: learner.boxes[name] for name in SETS if name in learner.boxes}
+    whole, arm = atlas.tree.n, list(atlas.arm)
+    return {name: rows[arm] if len(rows) == whole else rows for name, rows in boxes.items()}
 
 
 def arm_panels(atlas: AtlasResults) -> tuple[list[Panel], list[Panel]]:

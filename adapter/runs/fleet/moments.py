@@ -40,7 +40,6 @@ from drivers.interface import DriverError
 
 FORMAT = 1  # of the files of moments; another one is computed anew
 SEEN, FOLDER, GONE = "seen.jsonl", "moments", ".forgotten"
-READ_AT_ONCE = 1 << 20  # bytes
 ARM_KEYS = ("arm", "serial", "serial_number", "robot_serial", "arm_id")  # in a log's metadata
 
 
@@ -136,7 +135,7 @@ def _content(path: Path) -> str:
         if path.is_dir():
             digest.update(str(file.relative_to(path)).encode() + b"\0")
         with file.open("rb") as opened:
-            while block := opened.read(READ_AT_ONCE):
+            while block := opened.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
 
