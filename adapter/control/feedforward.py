@@ -17,15 +17,9 @@ from adapter.control.instant import (
 )
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
 from adapter.effects.base import LearnedEffect
-from adapter.effects.by_joint import (
-    ByJoint,
-    Gears,
-    JointSignals,
-    JointTorques,
-    smooth_sign,
-    to_links,
-)
+from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
 from adapter.effects.catalogue import effects_by_name
+from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array

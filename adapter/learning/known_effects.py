@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.by_joint import Gears, JointTorques, to_links
 from adapter.effects.catalogue import LEARNABLE, effects_by_name
+from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import JointMotion, jit

@@ -77,7 +77,6 @@ def arm_with(*effects):
 ON_JOINTS = [
     Effect("viscous_friction", (2,), {"Fv": 0.8}),
     Effect("coulomb_friction", (4,), {"Fc": 1.5}),
-    Effect("coulomb_friction", (7,), {"Fc": 0.5}),
     Effect("asymmetric_friction", (3,), {"Fc_pos": 1.2, "Fc_neg": 0.4}),
     Effect("stribeck_friction", (5,), {"Fc": 0.3, "Fs": 0.8, "vs": 0.2}),
     Effect("load_dependent_friction", (2,), {"Fl": 0.06}),
