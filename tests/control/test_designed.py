@@ -21,7 +21,7 @@ from adapter.errors import SettingsError
 from adapter.model.robots import documented
 from adapter.physics.identifiability import BODY_SIZE
 from sim.scenarios import build
-from tests.helpers.played import played
+from tests.helpers.live_tools import played
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)

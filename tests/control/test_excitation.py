@@ -25,7 +25,7 @@ from adapter.model.robots import documented
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
-from tests.helpers.played import played
+from tests.helpers.live_tools import played
 from tests.helpers.robot_models import pin_model
 
 PANDA = documented("panda")

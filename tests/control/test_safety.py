@@ -215,9 +215,7 @@ PUSH, SOFT = 25.0, 200.0  # N m; N m/rad: an arm that gives in a little is pushe
 
 
 def controller() -> ExcitationController:
-    made = ExcitationController(
-        LIMITS, ExcitationSettings(seed=1), expected=ModelFeedforward.of(PANDA)
-    )
+    made = controller_with()
     made.weight = CarriedWeight(PANDA)
     return made
 

@@ -143,9 +143,6 @@ def test_every_body_is_one_that_can_exist(name: str) -> None:
 
 
 def test_trees_that_are_none_are_refused() -> None:
-    for links in (4, 61):
-        with pytest.raises(ValueError, match="5 to 60"):
-            random_tree(links, seed=0)
     good = random_tree(5, seed=0)
     with pytest.raises(ValueError, match="have: -1"):
         replace(good, parent=(0, *good.parent[1:]))
