@@ -34,6 +34,7 @@ from adapter.physics.identifiability import frame_observability
 from adapter.runs.outcome import frame_errors
 from adapter.runs.terminal import console
 from sim.falls.data_set import Flight, data_set
+from sim.falls.fall import atlas
 
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
@@ -190,7 +191,8 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     say(f"simulating {args.trajectories} falls of {args.seconds:g} s, where none are kept")
     flight = Flight(args.seconds, seed=args.seed)
     options = {"trajectories": args.trajectories, "flight": flight, "folder": args.cache}
-    source = Falls(data_set("atlas", **options), data_set("atlas", noise=True, **options))
+    robot = atlas()
+    source = Falls(data_set(robot, **options), data_set(robot, noise=True, **options))
     truth, tree = source.truth, source.tree
     count = len(source)  # trajectories, all of one length
     parts = split(count * [len(source.exact(0))], args.seed)

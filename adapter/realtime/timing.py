@@ -18,8 +18,7 @@ from adapter.realtime.shared import SharedBlock
 
 SHARES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
 BITS = 9  # a bin is narrower than 1/512 of its value
-OCTAVES = 40  # up to 2^47 ns, a day and a half
-BINS = (OCTAVES + 2) << BITS
+BINS = (40 + 2) << BITS  # 40 octaves: up to 2^47 ns, a day and a half
 # What is counted, in the order of the rows of a `Timing`'s bins.
 COUNTED = ("tick_us", "loop_us", "plant_us", "lateness_us", "period_us", "age_us")
 

@@ -27,7 +27,6 @@ from markupsafe import Markup
 from adapter.effects.base import with_squares
 from adapter.effects.catalogue import CATALOGUE, effects_by_name
 from adapter.model.inertia import PARAMETERS, UNITS
-from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.realtime.showing import View
 from adapter.report.html import fill
@@ -42,10 +41,6 @@ DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimate
 ESTIMATE_S = 0.5
 FAST_ROWS, SLOW_ROWS = 400, 240  # kept of the past, for a page that comes late or comes back
 FIRST_S = 0.25  # between two of the slow rows, at first
-LAMBDA = (
-    *((f"turn about {axis}", "mrad") for axis in "xyz"),
-    *((f"shift along {axis}", "mm") for axis in "xyz"),
-)
 RECENT = ("t", "residual", "noise")  # of a frame, that a page gets of the past
 Message = dict[str, Any]
 
@@ -94,7 +89,10 @@ class Messages:
             "joints": list(arm.tree.joint_names),
             "links": list(arm.tree.link_names),
             "parents": list(arm.tree.parent),
-            "lambda": [list(entry) for entry in LAMBDA],
+            "lambda": [
+                *([f"turn about {axis}", "mrad"] for axis in "xyz"),
+                *([f"shift along {axis}", "mm"] for axis in "xyz"),
+            ],
             "theta": [list(entry) for entry in zip(PARAMETERS, UNITS, strict=True)],
             "theta_documented": numbers(arm.theta),
             "theta_alone": self._onlooker.shown_alone.tolist(),
@@ -102,7 +100,8 @@ class Messages:
                 [effect.title, with_squares(effect.units()[effect.key])]
                 for effect in effects_by_name(known.effects)
             ],
-            "reach_m": reach(arm),
+            # how far the arm reaches at most: for the scale of its picture
+            "reach_m": float(max(np.linalg.norm(arm.lam[:, 3:], axis=1).sum(), 1e-3)),
         }
 
     def history(self) -> bytes:
@@ -251,15 +250,6 @@ class Whole:
         self._due_s = t_s + self._every_s
 
 
-def reach(arm: SelfModel) -> float:
-    """How far the arm reaches at most, m: for the scale of its picture."""
-    lengths = np.linalg.norm(arm.lam[:, 3:], axis=1)
-    return float(max(lengths.sum(), 1e-3))
-
-
-Show = Callable[[Now], None]
-
-
 def page_of(known: KnownRun) -> tuple[str, str]:
     """HTML of the page and its Content-Security-Policy: nothing from elsewhere, no other script."""
     script = fill("live.js", {}, __package__)
@@ -303,7 +293,7 @@ def make_view(
     known: KnownRun, listening: socket.socket | None, foxglove_port: int | None
 ) -> Callable[[View], None]:
     """What the view process shows: the page, Foxglove's protocol, or both."""
-    onlooker, shows = Onlooker(known), list[Show]()
+    onlooker, shows = Onlooker(known), list[Callable[[Now], None]]()
     if listening is not None:
         shows.append(LivePage(onlooker, listening))
     if foxglove_port is not None:

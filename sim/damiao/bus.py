@@ -18,7 +18,6 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from sim.damiao.codec import REFRESH, SERVICE_ID, data_frame
 
 DATAGRAM_BYTES = 4096
-OWN_FRAMES = 256  # that may be under way
 BUFFER_BYTES = 1 << 20  # 0.1 s of frames at 1 kHz; the kernel may grant less
 INTERFACES = ("udp_multicast", "socketcan")
 MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
@@ -32,7 +31,7 @@ class BoardsMulticastBus(UdpMulticastBus):
         """Join a group. Raises can.CanInitializationError."""
         super().__init__(channel, port=port, hop_limit=0, fd=fd)  # frames do not leave the machine
         self._fd, self._to = fd, (channel, port)
-        self._own: deque[bytes] = deque(maxlen=OWN_FRAMES)
+        self._own: deque[bytes] = deque(maxlen=256)  # that may be under way
         self._socket = socket.socket(fileno=os.dup(self.fileno()))
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)

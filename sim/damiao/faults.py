@@ -51,7 +51,6 @@ STATUS = {
     "overcurrent": motor.OVER_CURRENT,
     "overload": motor.OVERLOAD,
 }
-LATE_NS = 3_000_000
 SPIKE_RAD, JUMP_RAD = 0.5, 0.1
 HOT_C = 130.0
 FAULT_STREAM = 1 << 33  # keeps the draws of faults apart from those of truth and noise
@@ -132,7 +131,7 @@ class Outbox:
             self._corrupt(message)
         if strikes("late", now_s):
             self._count += 1
-            heapq.heappush(self._later, (now_ns + LATE_NS, self._count, message))
+            heapq.heappush(self._later, (now_ns + 3_000_000, self._count, message))
         elif strikes("reorder", now_s):
             self._behind.append(message)
         else:

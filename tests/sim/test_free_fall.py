@@ -255,8 +255,6 @@ def test_sensors_add_what_is_documented(tmp_path: Path) -> None:
 
 
 def test_requests_that_cannot_be_met_say_why(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="have: atlas"):
-        data_set("talos", folder=tmp_path)
     for wrong in ({"trajectories": 0}, {"processes": 0}):
         with pytest.raises(ValueError, match="must be"):
             data_set(TREE, folder=tmp_path, **wrong)

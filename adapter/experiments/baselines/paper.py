@@ -17,7 +17,6 @@ from adapter.experiments.baselines.learner import (
 )
 from adapter.model.spatial import Array
 
-NETWORK_UNITS = 1000
 MEMBERS, UNITS, POINTS = 50, 4000, 10_000  # machines, units of each; samples, also of the process
 # (share of the epochs, share of ADAM's first rate): constant rates leave the loss where their
 # noise is.
@@ -25,8 +24,6 @@ SCHEDULE = ((0.35, 1.0), (0.3, 0.5), (0.2, 0.15), (0.15, 0.05))
 # Bounds of the length scales, in deviations of an input, and of the share of noise in variance.
 LENGTHS = (0.3, 300.0)
 NOISES = (1e-9, 1.0)
-# The share of noise is raised by this, a few times, where the kernel is singular in float64.
-RAISE, RAISES = 10.0, 6
 
 
 class FeedForward(ScaledBaseline):
@@ -39,7 +36,7 @@ class FeedForward(ScaledBaseline):
 
     def __init__(
         self,
-        units: int = NETWORK_UNITS,
+        units: int = 1000,
         epochs: int = 120,
         batch: int = 200,
         rate: float = 2e-3,
@@ -54,8 +51,8 @@ class FeedForward(ScaledBaseline):
             rate: of ADAM at the start.
             seed: of the weights and of the order of samples.
         """
-        self.units, self.epochs, self.batch, self.seed = units, epochs, batch, seed
-        self.rate = rate
+        self.units, self.epochs, self.batch = units, epochs, batch
+        self.rate, self.seed = rate, seed
 
     def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
         """Train on all samples in float32. Raises ModelError without scikit-learn."""
@@ -274,11 +271,11 @@ def negative_log_likelihood(logs: Array, x: Array, y: Array) -> tuple[float, Arr
 
 def _solved(kept: Array, y: Array, noise: float) -> tuple[Array, float]:
     """K⁻¹ y (m, outputs), and the share of noise that let K be factorised."""
-    for _ in range(RAISES):
+    for _ in range(6):  # the kernel may be singular in float64
         gram = kernel(kept, kept)
         gram[np.diag_indices(len(gram))] += noise
         try:
             return solve_positive(gram, y), noise
         except linalg.LinAlgError:
-            noise *= RAISE
+            noise *= 10.0
     raise ModelError(f"the kernel of the points is singular even with {noise:.1e} of noise")
