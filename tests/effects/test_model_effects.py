@@ -44,7 +44,6 @@ N = 7
 AT = StateLayout(N)
 MOTION = Motion(10.0, seed=4)
 LOAD = {"m": 1.0, "cx": 0.0, "cy": 0.01, "cz": 0.08, "inertia": [2e-3, 0, 0, 2e-3, 0, 2e-3]}
-TWO_FRICTIONS = (0.3, 0.03), (0.2, 0.04)  # N m s/rad: value and standard deviation
 FRICTION = ("viscous_friction", "coulomb_friction")
 
 
@@ -221,7 +220,8 @@ def test_a_surer_model_is_left_less_easily() -> None:
 
 def test_two_entries_of_one_effect_add_up_and_so_do_their_doubts() -> None:
     """As a search leaves them that found what an earlier one had left."""
-    twice = [entry("viscous_friction", (3,), Fv=x) | {"std": {"Fv": s}} for x, s in TWO_FRICTIONS]
+    told = (0.3, 0.03), (0.2, 0.04)  # N m s/rad: value and standard deviation
+    twice = [entry("viscous_friction", (3,), Fv=x) | {"std": {"Fv": s}} for x, s in told]
     model = with_effects(*twice)
     values, std = believed(lasting_effects(model.effects, N), FRICTION, N)
     assert values[0, 2] == pytest.approx(0.5) and std[0, 2] == pytest.approx(0.05)

@@ -162,10 +162,6 @@ def page() -> str:
     return render_experiment(atlas(), panda(), "Made by a <test>.")
 
 
-def sections(page: str) -> list[str]:
-    return re.findall(r'<(?:section|footer) id="(\w+)"', page)
-
-
 def test_page_stands_alone(page: str) -> None:
     ids_of_a_whole_page(page, "stated fig4 fig5 fig6 beyond provenance")
     assert "Made by a &lt;test&gt;." in page
@@ -242,7 +238,7 @@ def test_what_was_not_run_is_left_out_with_a_reason(
     with_atlas: bool, with_panda: bool, shown: str, reasons: list[str]
 ) -> None:
     found = render_experiment(atlas() if with_atlas else None, panda() if with_panda else None, "")
-    assert sections(found) == shown.split()
+    assert re.findall(r'<(?:section|footer) id="(\w+)"', found) == shown.split()
     told = re.search(r'id="reasons".*?</ul>', found, flags=re.S)
     assert told.group().count("<li>") == len(reasons)
     for reason in reasons:
