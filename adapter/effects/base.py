@@ -278,7 +278,7 @@ class Effect(ABC):
             zero. One prior for the search, the learner and the monitor.
         phrase: how to say that it is there.
         place: what a joint of a robot's file calls it (`urdf_text`), if it has a name for it.
-        shows: what it shows in the experiments of `splits` that touch it.
+        shows: what it shows in the experiments of `phrases` that touch it.
         positive: keys of parameters that physics keeps above zero.
         inexact: share of its torque that may be otherwise in truth: an idealised equation.
         band: share of its largest torque that may be otherwise where the joint is slow or rests:

@@ -1,6 +1,6 @@
 """A self model as URDF text, with the joint axes that its source had.
 
-What effects add to the arm comes in a record that knows nothing of them; `effects.export` fills it.
+What effects add to the arm comes in a record that knows nothing of them; `effects.robots` fills it.
 """
 
 from __future__ import annotations
