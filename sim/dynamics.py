@@ -6,14 +6,26 @@ over single numbers, which compile four times as fast as array terms.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from sim.compiled import compiled
-
+F = TypeVar("F", bound=Callable[..., object])
 Array = NDArray[np.float64]
+
+
+def compiled(function: F) -> F:
+    """Compile when first called, and keep that on disk.
+
+    What is kept is named after the module, too: it refers to classes of this package by name, and
+    where somebody else's module is called `sim` this package has another one.
+    """
+    function.__qualname__ = f"{function.__module__}.{function.__qualname__}"
+    return cast(F, njit(cache=True)(function))
+
 
 V, W, A, DW = range(4)  # rows of a body's motion
 

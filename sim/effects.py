@@ -39,7 +39,7 @@ Number = float | list[float]
 # Where an effect acts: on the motion of a joint, on the rigid bodies, at the flange, on what an
 # encoder or a torque sensor says. Name -> (place, needed keys, keys with a default).
 MOTION, BODY, WRENCH, ENCODER, TORQUE = "motion", "body", "wrench", "encoder", "torque"
-OBSTACLE = "obstacle"  # `sim.obstacles`
+OBSTACLE = "obstacle"  # `sim.joint_effects`
 SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "viscous_friction": (MOTION, ("Fv",), ()),
     "coulomb_friction": (MOTION, ("Fc",), ()),

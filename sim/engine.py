@@ -22,8 +22,7 @@ import pybullet as bullet
 
 from sim.dynamics import end_effector
 from sim.effects import WRENCH
-from sim.joint_effects import add_up, bend, friction, rows_of, step
-from sim.obstacles import Obstacles
+from sim.joint_effects import Obstacles, add_up, bend, friction, rows_of, step
 from sim.rigid_bodies import ArmClient, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
 

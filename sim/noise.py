@@ -25,7 +25,6 @@ BLOCK = 16  # samples drawn at once: dear enough one by one, a hitch in the loop
 TAPS = 256  # samples after which the band filter has forgotten an input but for 2e-4
 POINTS = 1 << 14  # of the band filter's response, over the frequencies up to half the rate
 MOVING = 0.1  # rad/s, from here on a joint's torque noise is that of motion
-MAX_JITTER = 0.45  # of a period: stamps stay in order
 
 Draw = Callable[[np.random.Generator], Array]
 
@@ -86,7 +85,7 @@ class SensorNoise:
             links = LinkMotion(links.twist + extra[:, 0], links.accel + extra[:, 1])
         stamp_ns = clean.stamp_ns
         if self._levels.stamp_jitter_s:
-            edge = MAX_JITTER / RATE_HZ
+            edge = 0.45 / RATE_HZ  # stamps stay in order
             stamp_ns += round(min(max(float(self._jitter.at(k)), -edge), edge) * 1e9)
         return JointSample(stamp_ns, clean.q + q, clean.dq + dq, tau, links)
 

@@ -23,7 +23,7 @@ from adapter.control.limits import MotionLimits, need_complete
 from adapter.control.path_motion import PathMotion
 from adapter.control.settings import ExcitationSettings
 from adapter.control.sweeps import MOVES, SweepMotion
-from adapter.effects.splits import DecidingExperiment
+from adapter.effects.phrases import DecidingExperiment
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array

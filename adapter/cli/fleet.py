@@ -16,8 +16,15 @@ from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_urdf
 from adapter.model.model_file import save_model, whole_file
-from adapter.report.fleet_page import write_fleet_page
-from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary, to_be_shown
+from adapter.report.fleet_page import (
+    HEADS,
+    as_json,
+    log_cells,
+    sentences,
+    summary,
+    to_be_shown,
+    write_fleet_page,
+)
 from adapter.runs.fleet import fleet
 from adapter.runs.fleet.arm import FleetArm
 from adapter.runs.terminal import console, output, results_folder, say, show, warn, write_json

@@ -27,7 +27,8 @@ from adapter.gap.servo_model import read_servos
 from adapter.gap.words import as_json, console_summary
 from adapter.gap.workflow import GapSettings, find_gap, names_of
 from adapter.model.model_file import load_model
-from adapter.report.gap_page import write_gap_page
+from adapter.report.gap_page import render_gap_page
+from adapter.report.html import write_whole
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import (
     complain,
@@ -140,7 +141,8 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
         written = write_urdf(load_model(result.model_out), urdf, told=True)
         more["urdf_out"] = str(urdf) if written else None
     if not args.no_report:
-        more["report"] = str(write_gap_page(result, folder / "report.html"))
+        page = write_whole(folder / "report.html", render_gap_page(result, folder))
+        more["report"] = str(page)
     _write(args, folder, {**as_json(result), **more})
     for line in console_summary(result):
         output.print(Text.from_markup(line), soft_wrap=True)

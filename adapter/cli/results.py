@@ -14,15 +14,15 @@ from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
-from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
+from adapter.effects.robots import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
-from adapter.report.headline import headline
 from adapter.report.next_steps import next_steps
+from adapter.report.trust import headline
 from adapter.report.words import NOT_WATCHED, is_live, missed_words, not_learned, small
 from adapter.report.worth import Worth
 from adapter.runs.outcome import Outcome

@@ -39,9 +39,8 @@ from adapter.errors import UsageError
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.realtime.following import FollowingObserver
+from adapter.realtime.following import FeedforwardBound, FollowingObserver, LearnedFeedforward
 from adapter.realtime.jobs import Jobs, RecordingJob
-from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.realtime.run_messages import ShownArm
 from adapter.realtime.showing import DisplayJob

@@ -24,12 +24,12 @@ class Served(NamedTuple):
 ARMS = {
     "fci": Served(
         "a Franka robot: FCI protocol 5 (Panda, FER) or 10 (FR3), on 127.0.0.1",
-        "sim.fci.options",
+        "sim.fci.faults",
         "sim.fci.server",
     ),
     "can": Served(
         "an arm of Damiao motors in MIT mode, on a python-can bus",
-        "sim.damiao.options",
+        "sim.damiao.faults",
         "sim.damiao.server",
     ),
     "ros2": Served(

@@ -33,7 +33,6 @@ GAINS_DELAY_NS = 1_000_000  # from a reading to its torque, for which the gains 
 STIFFNESS_PER_EFFORT = 5.0  # 1/rad, of an arm that is not known by name
 DAMPING_TIME_S = 0.03  # damping over stiffness, of the same
 
-DEFAULT_PERIOD_NS = 1_000_000
 RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an arm that checks it
 START_REACH = 0.02  # rad, further from where the motion was drawn from it does not start
 FADE_S = 1.0  # from feedback alone to feed-forward
@@ -154,7 +153,7 @@ class ExcitationController:
         self._fade_s, self._ticks, self._explained = 0.0, 0, np.zeros(n)
         self._carry: Callable[[Array], None] | None = None
         self._feedback_only, self._with_model = ErrorTally(n), ErrorTally(n)
-        self._take_on(DEFAULT_PERIOD_NS, False)
+        self._take_on(1_000_000, False)
 
     def attend(self, driver: Driver) -> None:
         """Learn the arm's period, whether it carries its own weight, and how late it acts.

@@ -17,13 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from adapter.control.cell import Cell
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
-from adapter.control.meshes import Mesh, read_mesh
 from adapter.control.path_motion import PathMotion
-from adapter.control.settings import ExcitationSettings
-from adapter.control.shapes import Body, bodies_of
+from adapter.control.settings import Cell, ExcitationSettings
+from adapter.control.shapes import Body, Mesh, bodies_of, read_mesh
 from adapter.errors import MeansError, SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_rpy, z_to_axis

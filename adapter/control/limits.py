@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.errors import SettingsError
-from adapter.model.robots.known import RobotFacts, facts_of
+from adapter.model.robots import RobotFacts, facts_of
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
 from drivers.interface import Driver

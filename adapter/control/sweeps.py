@@ -2,7 +2,7 @@
 
 One joint moves after the other, by moves at a constant speed with quintic ramps between them, so
 that friction is seen at each speed alone, at rest after either direction, or over its first
-millimetres. Which experiment wants which moves is said here; what it shows, in `effects.splits`.
+millimetres. Which experiment wants which moves is said here; what it shows, in `effects.phrases`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from adapter.control.limits import MotionLimits
 from adapter.control.path_motion import PathMotion, ramped, usable_range
 from adapter.control.settings import ExcitationSettings
-from adapter.effects.splits import BOTH_WAYS, SPEEDS, STILL, TURN, TURNS, DecidingExperiment
+from adapter.effects.phrases import BOTH_WAYS, SPEEDS, STILL, TURN, TURNS, DecidingExperiment
 from adapter.errors import SettingsError
 from adapter.model.spatial import Array
 

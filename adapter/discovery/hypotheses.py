@@ -212,7 +212,8 @@ class Scores:
         self.excess = dict.fromkeys(bodies.channels, 1.0)
         spread = np.sqrt(2.0 / (3.0 * log.noise_samples))
         self.tolerance = ALLOWANCE + DEVIATIONS * float(spread)
-        self._samples = 3.0 * log.motion_samples
+        # independent samples that the motion itself is worth
+        self._samples = 3.0 * max(1.0, 2.0 * log.duration_s * log.motion_hz)
 
     def of(self, link: int, column: int, parent: int) -> dict[str, float]:
         """Expected variance by channel of one hypothesis."""

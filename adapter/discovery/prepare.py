@@ -79,11 +79,6 @@ class PreparedLog:
     adrift: np.ndarray
 
     @property
-    def motion_samples(self) -> float:
-        """How many independent samples the motion itself is worth, at least one."""
-        return max(1.0, 2.0 * self.duration_s * self.motion_hz)
-
-    @property
     def noise_samples(self) -> float:
         """How many independent samples of noise the filter leaves, at least two."""
         return max(2.0, 2.0 * self.duration_s * self.cutoff_hz)

@@ -1,4 +1,4 @@
-"""Physical effects beside the rigid body, one file each: see `catalogue.CATALOGUE`."""
+"""Physical effects beside the rigid body, a file for each kind: see `catalogue.CATALOGUE`."""
 
 from adapter.effects.active import Active, active_effects, lasting_effects
 from adapter.effects.base import Effect, LinearEffect

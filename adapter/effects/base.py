@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import DecidingExperiment
+from adapter.effects.phrases import DecidingExperiment, Phrase
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import NO_PLACE, Additions
@@ -33,7 +32,6 @@ Flags = NDArray[np.bool_]
 Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-FEWEST_TO_FILTER = 100  # instants
 SMOOTH_HZ = 10.0  # low-pass of motions whose torques are compared as they are
 RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
 EVEN, PAUSE_STEPS = 1e-3, 10  # share of a step by which even ones differ; most that a pause is
@@ -182,7 +180,7 @@ class Motion:
 
     def _evenly(self, x: Array, made: Callable[[Array, float], Array]) -> Array:
         """A signal x (m,) as a filter makes it of even samples and their step (s)."""
-        if self.apart or len(x) < FEWEST_TO_FILTER:
+        if self.apart or len(x) < 100:  # instants
             return x
         steps = np.diff(self.t)
         step = float(np.median(steps))
@@ -280,7 +278,7 @@ class Effect(ABC):
             zero. One prior for the search, the learner and the monitor.
         phrase: how to say that it is there.
         place: what a joint of a robot's file calls it (`urdf_text`), if it has a name for it.
-        shows: what it shows in the experiments of `splits` that touch it.
+        shows: what it shows in the experiments of `phrases` that touch it.
         positive: keys of parameters that physics keeps above zero.
         inexact: share of its torque that may be otherwise in truth: an idealised equation.
         band: share of its largest torque that may be otherwise where the joint is slow or rests:

@@ -1,19 +1,16 @@
-"""Bristle friction (Dahl): tau = Fc z, dz/dt = (dq - |dq| z) / s0. Positive Fc opposes motion.
-
-What rubs does not slide at once: it bends over a way of about s0 first. How far it is bent, z, is
-between -1 and 1, depends on the way alone, not on its speed, and stays where the joint rests: at
-rest it is the band of static friction. Source: P. Dahl, A Solid Friction Model, 1968.
-"""
+"""Friction that may wind up over a small way before the joint slides, by Dahl and by LuGre."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 
 from adapter.effects.base import (
     LEVEL,
+    TWO_LEVELS,
     Array,
     JointSignals,
     JointTorque,
@@ -26,12 +23,13 @@ from adapter.effects.base import (
     on_joint,
 )
 from adapter.effects.by_joint import WAYS_RAD, shares_of_ways, smooth_sign
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import STILL, TURNS
+from adapter.effects.phrases import SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import FRICTION, Additions
 
 USUAL_RAD, TIMES = 1.5e-3, 3.0  # and by what factor it is off: a real Panda, a KUKA LWR4
 WAY = Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
+VELOCITIES = (0.03, 0.06, 0.12, 0.25)  # rad/s, tried for vs
+SCALE = Parameter("vs", "rad/s", lower=1e-3, upper=10.0, grid_share=0.03)
 
 
 @late_jit
@@ -80,7 +78,13 @@ class Rubs(JointTorque):
 
 
 class BristleFriction(LearnedEffect, Rubs):
-    """Coulomb friction that winds up over a small way before the joint slides."""
+    """Coulomb friction that winds up over a small way before the joint slides (Dahl).
+
+    tau = Fc z, dz/dt = (dq - |dq| z) / s0. Positive Fc opposes motion. What rubs does not slide at
+    once: it bends over a way of about s0 first. How far it is bent, z, is between -1 and 1, depends
+    on the way alone, not on its speed, and stays where the joint rests: at rest it is the band of
+    static friction. Source: P. Dahl, A Solid Friction Model, 1968.
+    """
 
     name = "bristle_friction"
     title = "bristle friction"
@@ -145,3 +149,73 @@ def _template(s0: float) -> Template:
         return {"Fc": float(x[0]), "s0": s0}
 
     return Template((1.0,), decode, f"s0 = {s0:.3g} rad")
+
+
+class StribeckFriction(Rubs):
+    """Friction that falls from Fs at rest to Fc in motion, and may wind up over a way before.
+
+    (Fc + (Fs - Fc) exp(-(dq/vs)^2)) sign(dq), or z of bristles for the sign. With bristles it is
+    LuGre's friction without damping (Canudas de Wit et al., A New Model for Control of Systems with
+    Friction, 1995), their stiffness being that of the level at which they slide.
+    """
+
+    name = "stribeck_friction"
+    title = "Stribeck friction"
+    parameters = (
+        Parameter("Fc", "N m"),
+        Parameter("Fs", "N m"),
+        SCALE,
+        replace(WAY, optional=True),
+    )
+    positive = ("Fc", "Fs")
+    log_odds = -3.0
+    inexact = 0.03
+    simpler = ((LEVEL, 0.01), (TWO_LEVELS, 0.01))
+    phrase = Phrase("{who} {lacks} Stribeck friction of {Fs} at rest and {Fc} in motion")
+    shows = ((SPEEDS, "falls as the joint gets faster"), (STILL, "fades or changes sign"))
+
+    def templates(self) -> tuple[Template, ...]:
+        """Both levels at several velocity scales, without bristles and with."""
+        return tuple(_falling(vs, s0) for s0 in (None, USUAL_RAD) for vs in VELOCITIES)
+
+    def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:
+        """Another vs, another s0."""
+        vs, s0 = float(values["vs"]), self.bristles(values)
+        other = _falling(SCALE.nearest(ratio * vs), s0)
+        return (other,) if s0 is None else (other, _falling(vs, WAY.nearest(ratio * s0)))
+
+    def log_odds_of(self, values: Values) -> float:
+        """As of bristles."""
+        s0 = self.bristles(values)
+        return 0.0 if s0 is None else log_odds_of_way(s0)
+
+    def possible(self, values: Values) -> bool:
+        """Friction that falls with speed, all of it positive."""
+        return 0.0 < float(values["Fc"]) < float(values["Fs"])
+
+    def level(self, dq: Array, values: Values) -> Array:
+        """The Stribeck curve."""
+        level, rest, vs = (values[key] for key in ("Fc", "Fs", "vs"))
+        return np.asarray(level + (rest - level) * np.exp(-((dq / vs) ** 2)))
+
+    def law(self, at: JointSignals, values: Values) -> Array:
+        """The curve times z, where there is a way over which bristles are known to be bent."""
+        z, s0 = at.direction, values.get("s0", WAY.lower)
+        if np.max(s0) > WAYS_RAD[0]:
+            bent = sum(x * y for x, y in zip(shares_of_ways(s0), at.bent, strict=True))
+            z = np.where(s0 > WAYS_RAD[0], bent, z)
+        return np.asarray(self.level(at.dq, values) * z)
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """What stays in motion, as dry friction."""
+        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
+
+
+def _falling(vs: float, s0: float | None = None) -> Template:
+    fixed = {"vs": vs} if s0 is None else {"vs": vs, "s0": s0}
+
+    def decode(x: Array) -> dict[str, Any]:
+        return {"Fc": float(x[0]), "Fs": float(x[1]), **fixed}
+
+    said = "" if s0 is None else f", s0 = {s0:.3g} rad"
+    return Template((1.0, 1.0), decode, f"vs = {vs:.3g} rad/s{said}")

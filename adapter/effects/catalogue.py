@@ -7,30 +7,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeGuard
 
-from adapter.effects.asymmetric_friction import AsymmetricFriction
-from adapter.effects.backlash import Backlash
 from adapter.effects.base import Effect, LearnedEffect
-from adapter.effects.base_tilt import BaseTilt
-from adapter.effects.bristle_friction import BristleFriction
-from adapter.effects.coulomb_friction import CoulombFriction
-from adapter.effects.encoder_offset import EncoderOffset
-from adapter.effects.encoder_ripple import EncoderRipple
-from adapter.effects.external_wrench import ExternalWrench
-from adapter.effects.friction_drift import FrictionDrift
-from adapter.effects.joint_elasticity import JointElasticity
-from adapter.effects.joint_spring import JointSpring
+from adapter.effects.bodies import BaseTilt, ExternalWrench, LinkInertia, Payload
+from adapter.effects.bristle_friction import BristleFriction, StribeckFriction
+from adapter.effects.encoders import Backlash, EncoderOffset, EncoderRipple, JointElasticity
+from adapter.effects.friction import (
+    AsymmetricFriction,
+    CoulombFriction,
+    FrictionDrift,
+    LoadDependentFriction,
+    ViscousFriction,
+)
+from adapter.effects.joint_torques import JointSpring, MotorInertia, TorqueRipple
 from adapter.effects.law import CURVES, LAWS
-from adapter.effects.link_inertia import LinkInertia
-from adapter.effects.load_dependent_friction import LoadDependentFriction
-from adapter.effects.motor_inertia import MotorInertia
-from adapter.effects.payload import Payload
-from adapter.effects.signal_delay import SignalDelay
-from adapter.effects.stribeck_friction import StribeckFriction
-from adapter.effects.torque_filter import TorqueFilter
-from adapter.effects.torque_gain import TorqueGain
-from adapter.effects.torque_offset import TorqueOffset
-from adapter.effects.torque_ripple import TorqueRipple
-from adapter.effects.viscous_friction import ViscousFriction
+from adapter.effects.sensors import SignalDelay, TorqueFilter, TorqueGain, TorqueOffset
 from adapter.errors import SettingsError
 from drivers.errors import choices
 

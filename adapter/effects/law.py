@@ -27,8 +27,7 @@ from adapter.effects.base import (
     on_joint,
     polar,
 )
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import SPEEDS, STILL, TURN
+from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
 
 LAW = "law: "  # begins the name of a law that has no other
 LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting

@@ -11,7 +11,7 @@ from adapter.errors import UsageError
 from adapter.runs.terminal import check_writable
 
 EXPERIMENTS = ("atlas", "panda")
-SPLIT = "adapter.experiments.split"  # brings NumPy; loaded by name where it is used
+SPLIT = "adapter.experiments.falls"  # brings NumPy; loaded by name where it is used
 LEAST_LEARNED = 50  # samples; far fewer show λ and θ of 30 joints only by chance
 
 

@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.baselines import presets
-from adapter.experiments.baselines.compare import Errors, arm_tables, compare
+from adapter.experiments.baselines.compare import Errors, arm_tables, compare, contenders
 from adapter.experiments.baselines.features import Columns, sub_chain, sub_parents
-from adapter.experiments.falls import Falls, gathered, sets_of
+from adapter.experiments.falls import Falls, Split, gathered, sets_of, split
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
 from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
-from adapter.experiments.split import Split, split
 from adapter.experiments.stated import PAPER_BASELINES, atlas_stated
 from adapter.experiments.topology import fall_logs, topology_trials
 from adapter.learning.batch.prediction_errors import (
@@ -36,8 +34,8 @@ from adapter.physics.identifiability import frame_observability
 from adapter.runs.outcome import frame_errors
 from adapter.runs.terminal import console
 from sim.falls.data_set import Flight, data_set
+from sim.falls.fall import atlas
 
-ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
 
@@ -193,7 +191,8 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     say(f"simulating {args.trajectories} falls of {args.seconds:g} s, where none are kept")
     flight = Flight(args.seconds, seed=args.seed)
     options = {"trajectories": args.trajectories, "flight": flight, "folder": args.cache}
-    source = Falls(data_set("atlas", **options), data_set("atlas", noise=True, **options))
+    robot = atlas()
+    source = Falls(data_set(robot, **options), data_set(robot, noise=True, **options))
     truth, tree = source.truth, source.tree
     count = len(source)  # trajectories, all of one length
     parts = split(count * [len(source.exact(0))], args.seed)
@@ -210,7 +209,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     if not args.no_baselines:
         learners += _baselines(args, source, parts, say)
     say("learning online, sample by sample")
-    used = [k for k in range(count) if k not in parts.control][:ONLINE_FALLS]
+    used = [k for k in range(count) if k not in parts.control][:3]  # 30 s in all
     motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
     online, _ = online_trial(motions, source.exact(parts.control[0]), truth.lam)
     say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")
@@ -263,7 +262,7 @@ def _baselines(
     index = sub_chain(tree, joints, carrier)
     arm = Columns(len(index)), sub_parents(tree, index), source.truth.lam[index]
     sets = arm_tables(source, parts, joints, carrier)
-    return compare(sets, presets.learners(*arm, args.full, args.seed), args.seed, say)
+    return compare(sets, contenders(*arm, args.full, args.seed), args.seed, say)
 
 
 # --- every number of the experiment under a key of its own --------------------------------------

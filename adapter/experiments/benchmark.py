@@ -20,8 +20,7 @@ import torch
 from rich.table import Table
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.export import to_urdf
-from adapter.effects.robots import read_robot
+from adapter.effects.robots import read_robot, to_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings

@@ -38,6 +38,8 @@ STATIONARY = 0.05
 UNEXPLAINED = 0.05
 # Added to a curvature whose diagonal is 1: where samples show nothing, nothing moves.
 LEVENBERG = 1e-10
+LONGEST_STEP = 0.05  # of an iteration, rad and m
+POSITION_SPAN = 0.5  # starting positions are uniform within ± this, m; angles within ±π
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,6 @@ class NetworkSettings:
         gain: weight of the newest batch in slope and curvature, above 0 and at most 1.
         constant: share of the iterations (0 to 1) in which it stays; then it falls so that all
             later batches count alike, which averages noise out.
-        longest_step: of an iteration, rad and m.
-        position_span: starting positions are uniform within ± this, m; angles within ±π.
         snapshots: iterations ("epochs") at which λ is kept, beside the last.
     """
 
@@ -61,8 +61,6 @@ class NetworkSettings:
     starts: int = 6
     gain: float = 0.3
     constant: float = 0.5
-    longest_step: float = 0.05
-    position_span: float = 0.5
     snapshots: tuple[int, ...] = (0, 50, 100)
 
 
@@ -108,9 +106,9 @@ def schema_by_networks(
         )
     check_motion(data)
     signals = network_signals(data, _channels(data))
-    rng, span = np.random.default_rng(seed), settings.position_span
+    rng = np.random.default_rng(seed)
     angles = rng.uniform(-np.pi, np.pi, (data.tree.n, settings.starts, 3))
-    p = rng.uniform(-span, span, angles.shape)
+    p = rng.uniform(-POSITION_SPAN, POSITION_SPAN, angles.shape)
     frames = StartFrames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
     batches = len(data) // settings.minibatch  # of a cycle; a rest is left out
     total = settings.cycles * batches
@@ -130,7 +128,7 @@ def schema_by_networks(
         curvature = (1.0 - gain) * curvature + gain * own
         step = (gain * newton_step(slope, curvature)).unflatten(-1, (2, 3))
         length = step.norm(dim=-1, keepdim=True)  # of the turn and of the shift
-        share = (settings.longest_step / length.clamp_min(1e-300)).clamp_max(1.0)
+        share = (LONGEST_STEP / length.clamp_min(1e-300)).clamp_max(1.0)
         frames = frames.moved((step * share).flatten(-2))
         losses[epoch] = cost.numpy()
     kept[total] = _lam(frames)

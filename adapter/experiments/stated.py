@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from adapter.experiments.baselines.elm import MEMBERS
+from adapter.experiments.baselines.paper import MEMBERS
+from adapter.experiments.falls import SETS
 from adapter.experiments.results import Stated
-from adapter.experiments.split import SETS
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL
 

@@ -13,7 +13,7 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import HELD, KNOWN, WRONG_LINK
 from adapter.effects.law import OverSignals
-from adapter.effects.splits import experiments
+from adapter.effects.phrases import experiments
 from adapter.gap.candidates import Pattern, prior_log_odds, signal_of
 from adapter.gap.evidence import LEAST_NM, Carried, Moments, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from adapter.effects.base import Template
-from adapter.effects.payload import parameters_of
+from adapter.effects.bodies import parameters_of
 from adapter.errors import ModelError
 from adapter.model.inertia import theta_from_body
 from adapter.model.self_model import FixedFrame, SelfModel

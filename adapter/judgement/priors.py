@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.catalogue import LEARNED
-from adapter.model.link_checks import made_up
+from adapter.model.robot_file import made_up
 from adapter.model.spatial import Array
 from adapter.screening.likelihood import LOAD_STD
 

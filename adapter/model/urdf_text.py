@@ -1,6 +1,6 @@
 """A self model as URDF text, with the joint axes that its source had.
 
-What effects add to the arm comes in a record that knows nothing of them; `effects.export` fills it.
+What effects add to the arm comes in a record that knows nothing of them; `effects.robots` fills it.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from adapter.model.tree import BASE
 DAMPING, FRICTION, ARMATURE, STIFFNESS = "damping", "friction", "armature", "stiffness"
 URDF_PLACES = (DAMPING, FRICTION)
 NO_PLACE = ""
+SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # of a tensor, as URDF names them
 NO_INERTIA = """<inertial>
   <mass value="0"/>
   <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
@@ -202,8 +203,7 @@ def check_possible(theta: Array, name: str) -> None:
 
 def six_named(tensor: Array) -> dict[str, float]:
     """The elements of a tensor (3, 3) by the names that URDF's <inertia> has for them."""
-    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    return dict(zip(keys, six_from_tensor(tensor).tolist(), strict=True))
+    return dict(zip(SIX, six_from_tensor(tensor).tolist(), strict=True))
 
 
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:

@@ -1,11 +1,24 @@
-"""Whoever in the loop goes on with the estimate that a live learner publishes."""
+"""Whoever in the loop goes on with the estimate that a live learner publishes.
+
+As feed-forward it is used as far as it can be believed. A published estimate may differ from the
+documented model by a load and by friction that nobody documented, and by three standard deviations
+of its own torque, at most as much again. Beyond that the documented model drives alone, until a
+later estimate is inside. Every change fades in.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from adapter.control.feedforward import Feedforward, ModelFeedforward
 from adapter.control.observer import ContactObserver
+from adapter.effects.active import Active
+from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, regressors
 from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader, SnapshotWriter
 from drivers.interface import JointSample
 
@@ -100,3 +113,154 @@ class FollowingObserver(EstimateFollower):
             what = seen.torque, seen.std, *seen.wrench(), joint
             self._board.publish_external(ExternalTorque(*what, seen.learned, sample.stamp_ns))
         return external
+
+
+LOAD_SHARE, LOAD_OFF_M = 0.25, 0.15  # of the arm's own mass, at the last link; off its origin
+FRICTION_SHARE = 0.1  # of the effort limit
+SIGMAS = 3.0
+RETURN_SHARE = 0.8  # of the bound, inside of which a later estimate is believed again
+FADE_CALLS = 500  # one in each tick
+
+
+class FeedforwardBound:
+    """By how much a learned model's torque may differ from the documented one's.
+
+    Args:
+        documented: the arm.
+        model: its torques; share it with who asks for the same motions.
+    """
+
+    def __init__(self, documented: SelfModel, model: ModelFeedforward) -> None:
+        self.model = model
+        n, tree = documented.tree.n, documented.tree
+        effort = np.where(np.isfinite(documented.limits.effort), documented.limits.effort, 0.0)
+        mass = LOAD_SHARE * float(documented.theta[:, 0].sum())
+        reach = mass * LOAD_OFF_M * float(np.linalg.norm(documented.gravity))
+        self._friction = FRICTION_SHARE * effort + reach
+        load = np.zeros((n, 10))
+        load[-1, 0] = mass
+        self._load = ModelFeedforward(tree, documented.gravity)
+        self._load.set(documented.lam, load, np.zeros((0, n)))
+        self._frames = frames_of(tree.parent, documented.lam)
+        self._base, self._Y = base_at_rest(documented.gravity)[None], np.zeros((1, n, 10 * n))
+        still = np.zeros(n)
+        self.at(still, still, still, np.zeros((n, 10)))  # compiled now
+
+    def at(self, q: Array, dq: Array, ddq: Array, theta_std: Array) -> Array:
+        """(n,) N m for a motion and standard deviations (n, 10) of θ."""
+        allowed = np.abs(self._load(q, dq, ddq)) + self._friction
+        regressors(self._frames, JointMotion(q[None], dq[None], ddq[None]), self._base, self._Y)
+        variance = self._Y[0] ** 2 @ np.nan_to_num(theta_std.reshape(-1)) ** 2
+        bound: Array = allowed + np.minimum(SIGMAS * np.sqrt(variance), allowed)
+        return bound
+
+
+class LearnedFeedforward(EstimateFollower, Feedforward):
+    """Inverse dynamics of the estimate that a learner publishes; ready once θ has converged.
+
+    Attach it (`attach`) when the snapshot exists; before that it is not ready.
+
+    Args:
+        tree: N and A.
+        gravity: (3,) m/s² in base axes.
+        effect_names: effects that the learner learns, in the order of the snapshot.
+        tool_theta: (10,) of a known tool on the last link, which θ leaves out.
+        known: lasting effects of the documented model that are not learned.
+        bound: how far it may be from the documented model; anything goes where None.
+
+    Attributes:
+        ready: an estimate of a converged θ was read.
+        notes: that it fell back, where it did.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        gravity: Array,
+        effect_names: Sequence[str] = (),
+        tool_theta: Array | None = None,
+        known: Sequence[Active] = (),
+        bound: FeedforwardBound | None = None,
+    ) -> None:
+        super().__init__()
+        self._model = ModelFeedforward(tree, gravity, effect_names, known)
+        self._tool = np.zeros((tree.n, 10))
+        if tool_theta is not None:
+            self._tool[-1] = tool_theta
+        self.ready = False
+        self._bound, self._std = bound, np.zeros((tree.n, 10))
+        self._asked = np.zeros((3, tree.n))
+        self._most = np.full(tree.n, np.inf)
+        self._jump, self._left = np.zeros((2, tree.n)), 0  # of the last change; calls to fade it
+        self._believed, self._trust = True, 1.0
+        self.notes: list[str] = []
+
+    def refresh(self) -> None:
+        """Take over the newest estimate if it is valid; one that is not leaves the last."""
+        snapshot = self.new_estimate()
+        if snapshot is not None:
+            theta = snapshot.theta + self._tool
+            if np.isfinite(theta).all() and np.isfinite(snapshot.lam).all():
+                before = self._learned()
+                effects = np.nan_to_num(snapshot.effects)
+                self._model.set(snapshot.lam, theta, effects, snapshot.effect_shapes)
+                self._fade_from(before)
+                self._std = snapshot.theta_std
+        if self.ready and self._bound is not None:
+            q, dq, ddq = self._asked
+            self._most = self._bound.at(q, dq, ddq, self._std)
+
+    def _learned(self) -> Array:
+        """(2, n) N m: what the present parameters say of the last motion, and of its posture."""
+        moving = self._model(*self._asked) + self._jump[0] * self._left / FADE_CALLS
+        return np.array(
+            [moving, self._model.unbent(self._asked[0]) + self._jump[1] * self._left / FADE_CALLS]
+        )
+
+    def _fade_from(self, before: Array) -> None:
+        """From what was said before to what the new parameters say."""
+        self._left = 0
+        if self.ready and self._trust > 0.0:
+            self._jump, self._left = before - self._learned(), FADE_CALLS
+        self.ready = True
+        if self._bound is not None and self._trust == 0.0:
+            q, dq, ddq = self._asked
+            apart = np.abs(self._model(q, dq, ddq) - self._bound.model(q, dq, ddq))
+            self._believed = bool((apart <= RETURN_SHARE * self._most).all())
+
+    def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Torques (n,) N m of a motion."""
+        self._asked[0], self._asked[1], self._asked[2] = q, dq, ddq
+        tau = self._model(q, dq, ddq)
+        if self._left:
+            self._left -= 1
+            tau = tau + self._jump[0] * (self._left / FADE_CALLS)
+        if self._bound is None or not self.ready:
+            return tau
+        documented = self._bound.model(q, dq, ddq)
+        apart = tau - documented
+        beyond = np.abs(apart) > self._most
+        if beyond.any():
+            self._fall_back(int(np.argmax(beyond)), apart)
+            apart = np.minimum(np.maximum(apart, -self._most), self._most)
+        step = 1.0 / FADE_CALLS
+        self._trust = min(max(self._trust + (step if self._believed else -step), 0.0), 1.0)
+        return documented + self._trust * apart
+
+    def _fall_back(self, j: int, apart: Array) -> None:
+        self._believed = False
+        if not self.notes:
+            self.notes.append(
+                f"the learned torque of joint {j + 1} was {apart[j]:.1f} N m from the documented "
+                f"model's (at most {self._most[j]:.1f} N m are believed); feed-forward fell back "
+                "to the documented model"
+            )
+
+    def unbent(self, q: Array) -> Array:
+        """Torques (n,) N m of holding still with nothing bent."""
+        tau = self._model.unbent(q) + self._jump[1] * (self._left / FADE_CALLS)
+        if self._bound is None or self._trust == 1.0:
+            return tau
+        documented = self._bound.model.unbent(q)
+        apart = np.minimum(np.maximum(tau - documented, -self._most), self._most)
+        return documented + self._trust * apart

@@ -23,9 +23,7 @@ from typing import Any
 import numpy as np
 
 from adapter.model.spatial import Array
-from adapter.realtime.loop_board import LoopBoard
-from adapter.realtime.raw_layout import RawLayout
-from adapter.realtime.ring import Ring
+from adapter.realtime.ring import RawLayout, Ring
 from adapter.realtime.run_messages import RunMessages, ShownArm, estimate_names
 from adapter.realtime.shared import leave
 from adapter.realtime.showing import DisplayJob
@@ -35,6 +33,7 @@ from adapter.realtime.snapshot import (
     SnapshotReader,
     SnapshotWriter,
 )
+from adapter.realtime.timing import LoopBoard
 from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
 from drivers.files.mcap import FLUSH_S, McapWriter
 from drivers.files.messages import Message

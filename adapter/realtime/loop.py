@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from adapter.control.controller import ExcitationController
-from adapter.realtime.clock import Clock
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
-from adapter.realtime.real_time import DEFAULT_PRIORITY, RealTime, split_cores
+from adapter.realtime.real_time import Clock, RealTime, split_cores
 from adapter.realtime.session import Ended, Session, stop_arm
 from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
@@ -40,8 +39,6 @@ class LiveOptions:
 
     Attributes:
         duration_s: until the safe stop begins; None runs until somebody stops it.
-        priority: of SCHED_FIFO; None stays ordinary.
-        lock_memory: whether to ask for it.
         deadman: stop safely as well when the operator's terminal or the parent process is gone.
         shared_memory: sizes and names.
         before_motion: called once the motion is drawn (the controller knows it) and before the
@@ -51,8 +48,6 @@ class LiveOptions:
     """
 
     duration_s: float | None = None
-    priority: int | None = DEFAULT_PRIORITY
-    lock_memory: bool = True
     deadman: bool = False
     shared_memory: SharedMemoryOptions = field(default_factory=SharedMemoryOptions)
     before_motion: Callable[[Callable[[], bool]], None] | None = None
@@ -134,17 +129,14 @@ class Deadman:
 
     The operator is gone when the terminal was closed, or the program that started this one ended.
     Where standard input is no terminal (a service, a pipe), the parent process alone is watched.
-
-    Args:
-        terminal: file descriptor of the operator's terminal.
     """
 
-    def __init__(self, terminal: int = 0) -> None:
+    def __init__(self) -> None:
         self._parent = os.getppid()
         self._poll: select.poll | None = None
-        if os.isatty(terminal):
+        if os.isatty(0):
             self._poll = select.poll()
-            self._poll.register(terminal, 0)  # a hang-up is told without being asked for
+            self._poll.register(0, 0)  # a hang-up is told without being asked for
 
     def gone(self) -> bool:
         """Whether nobody is there to stop the arm any more."""
@@ -201,7 +193,7 @@ def run_live(
         supervisor.start(cancelled=lambda: stop.count > 0)
         stack.callback(driver.close)
         driver.connect()
-        real_time = RealTime(min(split_cores()[0]), options.priority, options.lock_memory)
+        real_time = RealTime(min(split_cores()[0]))
         session = None
         try:
             session = Session(

@@ -1,19 +1,22 @@
 """What a loop asks of the operating system: priority, locked memory, its own core, no collector.
 
-Nothing is demanded: each request says in one line whether it was granted, and why not.
+Nothing is demanded: each request says in one line whether it was granted, and why not. And its
+deadlines, t0 + k * period: no drift, and a missed one is missed, not postponed.
 """
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import os
 import resource
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
 MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
-DEFAULT_PRIORITY = 70  # above the kernel's interrupt threads (50), below its watchdogs (99)
+PRIORITY = 70  # of SCHED_FIFO: above the kernel's interrupt threads (50), below its watchdogs (99)
 
 
 # One clear sentence on a request, and what takes back what was granted; None where nothing was.
@@ -30,42 +33,26 @@ class RealTime:
     """Asks on entry, gives everything back on exit. For the thread that runs the loop.
 
     Args:
-        core: the loop's core; None leaves the scheduler its choice.
-        priority: of SCHED_FIFO, 1 to 99; None does not ask.
-        lock: whether to lock memory.
+        core: the loop's.
 
     Attributes:
         grants: the answers' sentences, in order.
     """
 
-    def __init__(
-        self,
-        core: int | None = None,
-        priority: int | None = DEFAULT_PRIORITY,
-        lock: bool = True,
-    ) -> None:
-        self._core, self._priority, self._lock = core, priority, lock
-        self._undo = ExitStack()
+    def __init__(self, core: int) -> None:
+        self._core, self._undo = core, ExitStack()
         self.grants: list[str] = []
 
     def __enter__(self) -> RealTime:
-        self._ask(quiet_collector())
-        if self._lock:
-            self._ask(lock_memory())
-        if self._core is not None:
-            self._ask(pin({self._core}))
-        if self._priority is not None:
-            self._ask(request_fifo(self._priority))
+        for answer in (quiet_collector(), lock_memory(), pin({self._core}), request_fifo(PRIORITY)):
+            line, undo = answer
+            self.grants.append(line)
+            if undo is not None:
+                self._undo.callback(undo)
         return self
 
     def __exit__(self, *error: object) -> None:
         self._undo.close()
-
-    def _ask(self, answer: Answer) -> None:
-        line, undo = answer
-        self.grants.append(line)
-        if undo is not None:
-            self._undo.callback(undo)
 
 
 def request_fifo(priority: int) -> Answer:
@@ -127,3 +114,98 @@ def quiet_collector() -> Answer:
             gc.enable()
 
     return "collector: frozen and off", undo
+
+
+SPIN_NS = 120_000  # wait actively for so long: waking up takes the system some 50 to 100 µs
+TIMER_ABSTIME = 1  # <time.h>
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+def sleep_until(deadline_ns: int) -> None:
+    """Sleep until CLOCK_MONOTONIC shows `deadline_ns`, or until a signal."""
+    at = _Timespec(*divmod(deadline_ns, 1_000_000_000))
+    code = _libc.clock_nanosleep(time.CLOCK_MONOTONIC, TIMER_ABSTIME, ctypes.byref(at), None)
+    if code not in (0, errno.EINTR):
+        raise OSError(code, os.strerror(code))
+
+
+class Clock:
+    """Deadlines of a periodic loop.
+
+    Args:
+        period_ns: between deadlines.
+        spin_ns: how long before a deadline sleeping ends and spinning begins.
+        now: CLOCK_MONOTONIC, ns.
+        sleep: returns at a time of that clock, or earlier.
+        used: processor time that this thread has used, ns.
+
+    Attributes:
+        k: number of the deadline that `wait` returned at last; -1 before the first.
+        missed: deadlines that went by unused.
+        missed_own: of these, such as the loop's own work filled, by the processor time that it
+            used; at the others the machine had given the processor to somebody else.
+    """
+
+    def __init__(
+        self,
+        period_ns: int,
+        spin_ns: int = SPIN_NS,
+        now: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[int], None] = sleep_until,
+        used: Callable[[], int] = time.thread_time_ns,
+    ) -> None:
+        self.period_ns, self.k, self.missed, self.missed_own = period_ns, -1, 0, 0
+        self._spin_ns, self._now, self._sleep, self._used = spin_ns, now, sleep, used
+        self._used_ns = 0
+        self._t0: int | None = None
+
+    def start(self) -> None:
+        """Deadline 0 is one period from now."""
+        self._t0 = self._now() + self.period_ns
+        self.k, self.missed, self.missed_own = -1, 0, 0
+        self._used_ns = self._used()
+
+    def follow(self, now_ns: int) -> None:
+        """Where the source keeps the rhythm: a tick begins; periods without one count as missed."""
+        if self._t0 is not None:
+            skipped = round((now_ns - self._t0) / self.period_ns) - 1
+            if skipped > 0:
+                self.missed += skipped
+                self.missed_own += self._own(skipped)
+        self._t0, self._used_ns = now_ns, self._used()
+
+    def _own(self, skipped: int) -> int:
+        """Of the deadlines that went by, such as the loop's own work filled, or ran into."""
+        periods = (self._used() - self._used_ns) / self.period_ns
+        return min(skipped, int(periods) + 1) if periods > 1.0 else 0
+
+    def wait(self) -> int:
+        """Wait for the next deadline; returns by how much it is late, ns.
+
+        Late by up to a period, the loop goes on at once. Later than that, the deadlines that
+        are gone count as missed and the next one in the future is waited for.
+        """
+        if self._t0 is None:
+            self.start()
+        assert self._t0 is not None
+        k = self.k + 1
+        behind = self._now() - (self._t0 + k * self.period_ns)
+        if behind > self.period_ns:
+            skipped = behind // self.period_ns + 1
+            self.missed += skipped
+            self.missed_own += self._own(skipped)
+            k += skipped
+        self.k = k
+        deadline = self._t0 + k * self.period_ns
+        wake = deadline - self._spin_ns
+        while self._now() < wake:
+            self._sleep(wake)
+        now = self._now()
+        while now < deadline:
+            now = self._now()
+        self._used_ns = self._used()
+        return now - deadline

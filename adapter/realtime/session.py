@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Any
 
 from adapter.control.controller import ExcitationController
-from adapter.control.sample_clock import SampleClock
+from adapter.control.reading_gate import SampleClock
 from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
 from adapter.realtime.following import FollowingObserver

@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from adapter.model.spatial import Array
-from adapter.realtime.loop_board import LoopBoard, LoopTiming
 from adapter.realtime.ring import Ring
 from adapter.realtime.shared import leave
 from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotError, SnapshotReader
+from adapter.realtime.timing import LoopBoard, LoopTiming
 from adapter.realtime.worker import Port
 
 NEWEST = 512  # records that one look takes in at most

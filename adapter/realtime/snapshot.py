@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from adapter.errors import MeansError
 from adapter.model.self_model import LAMBDA_SOURCES
 from adapter.model.spatial import Array
-from adapter.realtime.shared import SharedBlock, SharedMemoryError
-from adapter.realtime.slots import SEQUENCE, Slots, split
+from adapter.realtime.shared import SEQUENCE, SharedBlock, SharedMemoryError, Slots, split
 from drivers.files.bounded import parse_json
 
 MAGIC = 0x5041534E41503035  # "PASNAP05"

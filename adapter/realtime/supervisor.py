@@ -16,13 +16,12 @@ import numpy as np
 
 from adapter.model.spatial import Array
 from adapter.realtime.jobs import Jobs, LearnerJob, LearnerTask, RecorderTask, RecordingJob
-from adapter.realtime.loop_board import LoopBoard
-from adapter.realtime.raw_layout import RawLayout
 from adapter.realtime.real_time import split_cores
-from adapter.realtime.ring import Ring, affordable_rows
+from adapter.realtime.ring import RawLayout, Ring, affordable_rows
 from adapter.realtime.shared import SharedMemoryError
 from adapter.realtime.showing import DisplayTask
 from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotError, SnapshotWriter
+from adapter.realtime.timing import LoopBoard
 from adapter.realtime.worker import (
     RESTARTS,
     RestartableWorker,

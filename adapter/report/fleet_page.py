@@ -1,27 +1,178 @@
-"""The page of a fleet: arm by arm what holds, what drifts, and what each recording carried."""
+"""What a fleet found: in words, as figures, and as a page."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adapter.effects.catalogue import KNOWN
-from adapter.report.fleet_words import EPOCH_S, HEADS, log_cells, sentences, summary, to_be_shown
+from adapter.model.numbers import plus_minus
 from adapter.report.html import fill, write_whole
 from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
 from adapter.report.words import with_doubt
-from adapter.runs.fleet.arm import DAY_S, FleetArm, OfLog
+from adapter.runs.fleet.arm import DAY_S, TIME, FleetArm, OfLog
+from adapter.runs.fleet.course import Drift, StandsOut
 from adapter.runs.fleet.fleet import Fleet
 
-MOST_ROWS = 300  # of recordings; of more those that there is something to say of
+HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
+FEW = 4  # joints to be named in a table
+EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
+MOST_ROWS = 300  # of recordings on the page; of more those to say something of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
+MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording, as figures
+
+
+def log_cells(log: OfLog) -> tuple[str, ...]:
+    """A recording's row under `HEADS`."""
+    worst, begin_s = int(np.argmax(log.rmse)), log.moments.begin_s
+    begins = f"{begin_s:.1f} s"
+    if begin_s >= EPOCH_S:
+        begins = f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
+    return (
+        Path(log.moments.path).name,
+        begins,
+        f"{log.moments.span_s:.0f}",
+        "" if log.load is None else _signed(*log.load),
+        f"{log.rmse[worst]:.3f} ({worst + 1})",
+        _less(log.worth),
+        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
+    )
+
+
+def to_be_shown(arm: FleetArm, most: int) -> list[int]:
+    """Numbers of an arm's recordings: all, or of more than `most` those to say something of."""
+    if len(arm.logs) <= most:
+        return list(range(len(arm.logs)))
+    out = {x.number for x in arm.standing_out}
+    out |= {k for k, x in enumerate(arm.logs) if x.load is not None or x.disagrees}
+    return sorted(out)[:most]
+
+
+def _signed(value: float, std: float) -> str:
+    return "+" * (value > 0.0) + plus_minus(value, std)
+
+
+def drift_words(drift: Drift) -> str:
+    """A sentence."""
+    effect, per = KNOWN[drift.effect], f"per unit of {drift.follows}"
+    unit = effect.parameters[0].written
+    per = "a day" if drift.follows == TIME else per
+    share = f" ({100.0 * drift.span / abs(drift.usual):.0f} % of it)" if drift.usual else ""
+    or_ = "".join(f" or {x}" for x in drift.rivals)
+    doubt = "; these recordings cannot tell which" if drift.rivals else ""
+    return (
+        f"{effect.title.capitalize()} of joint {drift.joint} follows {drift.follows}{or_}: "
+        f"{_signed(drift.slope, drift.std)} {unit} {per}, {drift.span:.3g} {unit} over all"
+        f"{share}{doubt}"
+    )
+
+
+def standing_out_words(arm: FleetArm) -> Iterator[str]:
+    """A sentence for each recording with parameters that the others do not have."""
+    by_log: dict[int, list[StandsOut]] = {}
+    for one in arm.standing_out:
+        by_log.setdefault(one.number, []).append(one)
+    for number, several in sorted(by_log.items()):
+        told = [
+            f"{KNOWN[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
+            f"{KNOWN[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
+            for x in several
+        ]
+        yield f"{Path(arm.logs[number].moments.path).name} stands out: {'; '.join(told)}"
+
+
+def sentences(arm: FleetArm) -> list[str]:
+    """What there is to say of an arm's recordings."""
+    found = [drift_words(x) for x in arm.drifts]
+    for log in arm.logs:
+        if log.disagrees:
+            worst = int(np.argmax(log.rmse / log.own_rmse))
+            found.append(
+                f"{Path(log.moments.path).name} disagrees with the others on "
+                f"joint {', '.join(map(str, log.disagrees))}: {log.rmse[worst]:.2g} N m on joint "
+                f"{worst + 1} where a model of its own leaves {log.own_rmse[worst]:.2g}; another "
+                f"arm, or a change{'' if log.used else '; the model is learned without it'}"
+            )
+    found += standing_out_words(arm)
+    used = [x for x in arm.logs if x.used]
+    if len(used) > 1:
+        best = max(used, key=lambda x: x.worth)
+        found.append(
+            f"The motion of {Path(best.moments.path).name} would teach most if repeated: standard "
+            f"deviations would be {_less(best.worth)} less (geometric mean)"
+        )
+    return found
+
+
+def _less(worth: float) -> str:
+    """By how much standard deviations become less with so many nats a parameter more."""
+    return f"{-100.0 * np.expm1(-worth):.2g} %"
+
+
+def summary(found: Fleet) -> list[str]:
+    """What was done, in one line."""
+    arms = len(found.arms)
+    parts = ["1 arm" if arms == 1 else f"{arms} arms"]
+    parts += [f"{found.read} recordings read", f"{found.known} known"]
+    for number, word in ((len(found.broken), "broken"), (len(found.forgotten), "forgotten")):
+        parts += [f"{number} {word}"] if number else []
+    return [", ".join(parts)]
+
+
+def as_json(found: Fleet) -> dict[str, Any]:
+    """As figures."""
+    return {
+        "read": found.read,
+        "known": found.known,
+        "broken": [x._asdict() for x in found.broken],
+        "forgotten": list(found.forgotten),
+        "alike": [list(pair) for pair in found.alike],
+        "arms": [_arm_json(arm) for arm in found.arms],
+    }
+
+
+def _arm_json(arm: FleetArm) -> dict[str, Any]:
+    std = arm.outcome.effects_std
+    return {
+        "name": arm.name,
+        "theta": arm.model.theta,
+        "theta_std": arm.model.theta_std,
+        "effects": {
+            name: {"value": arm.outcome.effects[k], "std": std[k]}
+            for k, name in enumerate(arm.effects)
+        },
+        "drifts": [asdict(x) for x in arm.drifts],
+        "standing_out": [
+            {**x._asdict(), "path": arm.logs[x.number].moments.path} for x in arm.standing_out
+        ],
+        "logs": [
+            {
+                **{key: getattr(log.moments, key) for key in MOMENTS},
+                "load": None if log.load is None else log.load._asdict(),
+                "rmse_nm": log.rmse,
+                "own_rmse_nm": log.own_rmse,
+                "used": log.used,
+                "disagrees": list(log.disagrees),
+                "worth_nats": log.worth,
+            }
+            for log in arm.logs
+        ],
+        "notes": sentences(arm),
+    }
 
 
 def write_fleet_page(found: Fleet, path: str | Path) -> Path:
-    """Write the page. Raises RunFolderError."""
+    """Write the page: arm by arm what holds, what drifts, what each log carried.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+    """
     context: dict[str, Any] = {
         "headline": summary(found)[0],
         "arms": [_arm(arm) for arm in found.arms],

@@ -15,9 +15,8 @@ from adapter.gap.result import GapResult, Leftover
 from adapter.model.numbers import DASH, plain
 from adapter.model.robots import names as robot_names
 from adapter.report import gap_tables as tables
-from adapter.report.gap_panels import error_panels
-from adapter.report.gap_signatures import signature_panels, unexplained_panels
-from adapter.report.html import fill, write_whole
+from adapter.report.gap_panels import error_panels, signature_panels, unexplained_panels
+from adapter.report.html import fill
 from adapter.report.next_steps import Step, command
 from adapter.report.tables import Tile
 from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
@@ -39,15 +38,6 @@ def render_gap_page(result: GapResult, folder: Path | None = None) -> str:
     return fill("gap.html", context(result, folder))
 
 
-def write_gap_page(result: GapResult, path: str | Path) -> Path:
-    """Write the page, whole or not at all. Returns the path.
-
-    Raises:
-        RunFolderError: the file cannot be written.
-    """
-    return write_whole(path, render_gap_page(result, Path(path).parent))
-
-
 def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     """What the template shows."""
     told = result.problem is None
@@ -66,7 +56,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "several": len(result.recordings) > 1,
         "tiles": shown,
         "columns": max(len(shown), 1),
-        "findings": tables.finding_rows(result),
+        "findings": [tables.finding_row(same) for same in words.by_kind(result.findings)],
         "matrix": tables.joint_matrix(result),
         "carried": tables.carried_table(result),
         "contradictions": [capital(text) for text in result.contradictions],

@@ -17,9 +17,6 @@ from adapter.model.spatial import Array
 from adapter.report.tables import Table
 from adapter.report.words import NARROW, capital
 
-MOST_CORRECTIONS = 6
-
-
 UNIT = re.compile(
     r"(?<=\d) (N m s/rad|N m/rad|N m/s|N m|kg m²|kg m|kg|N|mrad|rad|mm|ms|s|%)(?![\w²])"
 )
@@ -43,12 +40,8 @@ class FindingRow:
     worth: str
 
 
-def finding_rows(result: GapResult) -> list[FindingRow]:
+def finding_row(findings: Sequence[Finding]) -> FindingRow:
     """What, where, when, how much, how sure: one row for what is the same on several joints."""
-    return [_row(findings) for findings in by_kind(result.findings)]
-
-
-def _row(findings: Sequence[Finding]) -> FindingRow:
     first = findings[0]
     ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
     joints = sorted({j for f in ordered for j in f.joints})
@@ -217,7 +210,7 @@ def correction_table(result: GapResult) -> Table | None:
     if ratio is None or result.corrections is None or result.corrections_prior is None:
         return None
     rows = []
-    for place in np.argsort(-np.abs(ratio), axis=None)[:MOST_CORRECTIONS]:
+    for place in np.argsort(-np.abs(ratio), axis=None)[:6]:
         link, part = np.unravel_index(place, ratio.shape)
         if ratio[link, part] == 0.0:
             break

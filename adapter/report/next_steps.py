@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from adapter.model.self_model import MJCF
-from adapter.report.torque_panels import refusal, theta_started
+from adapter.report.learned_panels import refusal, theta_started
 from adapter.report.words import is_live, not_learned
 from adapter.report.worth import SLOW, Worth, slow_share
 from adapter.runs.run_folder import RunData

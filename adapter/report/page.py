@@ -10,14 +10,12 @@ import numpy as np
 
 from adapter.gap.monitor_judge import sentence
 from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.report import tables, torque_panels, words
-from adapter.report.headline import against, headline
+from adapter.report import learned_panels, tables, words
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import next_steps
-from adapter.report.schema_panels import schema_panels
 from adapter.report.skeleton import has_reference, skeleton_panels
 from adapter.report.style import ACCENT, JOINT_COLORS, Drawing, Panel, time_axis
-from adapter.report.trust import checks
+from adapter.report.trust import against, checks, headline
 from adapter.report.worth import Worth, worth_panels, worth_table
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL
@@ -46,9 +44,10 @@ def write_report(path: str | Path, data: RunData) -> Path:
 
 def context(data: RunData) -> dict[str, Any]:
     """What the template shows."""
-    figures, started, worth = data.figures, torque_panels.theta_started(data), Worth.of(data)
-    fit = data.times(data.score_trace)[torque_panels.fit_window(data)] if started else []
+    figures, started, worth = data.figures, learned_panels.theta_started(data), Worth.of(data)
+    fit = data.times(data.score_trace)[learned_panels.fit_window(data)] if started else []
     fault, start_s = figures.get("fault"), figures.get("start_s") or 0.0
+    errors = learned_panels.error_panel, learned_panels.error_by_joint
     ended = [f"The run ended early: {fault}"] if fault else []
     new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
     return {
@@ -66,16 +65,16 @@ def context(data: RunData) -> dict[str, Any]:
         "joints": [
             (j % JOINT_COLORS + 1, name) for j, name in enumerate(data.documented.tree.joint_names)
         ],
-        "schema": schema_panels(data),
+        "schema": learned_panels.schema_panels(data),
         "skeleton": skeleton_panels(data),
         "has_reference": has_reference(data),
         "started": started,
         "torque_goal": f"{TORQUE_GOAL:g}",
-        "body_parts": torque_panels.BODY_PARTS,
-        "bodies": torque_panels.body_panels(data) if started else [],
-        "effects": torque_panels.effect_panels(data) if started else [],
-        "prequential": torque_panels.prequential_panels(data) if started else [],
-        "fit": torque_panels.fit_panels(data) if started else [],
+        "body_parts": learned_panels.BODY_PARTS,
+        "bodies": learned_panels.body_panels(data) if started else [],
+        "effects": learned_panels.effect_panels(data) if started else [],
+        "prequential": [panel(data) for panel in (errors if started else ())],
+        "fit": learned_panels.fit_panels(data) if started else [],
         "fit_span": f"{words.number(fit[0])} to {words.quantity(fit[-1], 's')}" if len(fit) else "",
         "joint_tables": tables.joint_tables(data),
         "matrices": [tables.schema_matrix(data), tables.theta_matrix(data)],

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from adapter.control.cell import Box, Cell, Mesh
 from adapter.control.excitation import plan_lines
 from adapter.control.free_path import ArmInCell, Clearance
 from adapter.control.limits import MotionLimits
-from adapter.control.meshes import read_mesh
 from adapter.control.path_motion import PathMotion
+from adapter.control.settings import Box, Cell, Mesh
+from adapter.control.shapes import read_mesh
 from adapter.model.spatial import Array, matrix_from_rpy
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import Step

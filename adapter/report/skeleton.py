@@ -25,9 +25,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "reference": {"color": GOAL, "linewidth": 1.0, "linestyle": (0, (4, 2))},
     "initial": {"color": INK, "linewidth": 1.2, "linestyle": (0, (1, 1.2))},
 }
-AXIS_SHARE = 0.06  # half length of a joint axis, of the arm's size
 SCALE_M = 0.2
-POSTURES = 60  # of the run that are looked at
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def posture(data: RunData) -> Array:
 def some_postures(data: RunData) -> Array:
     """(k, n) rad: postures of the run, spread over it; none where nothing was kept."""
     q = data.score_signals()[0] if len(data.score_trace) else np.zeros((0, data.n))
-    return np.asarray(q[np.linspace(0, len(q) - 1, min(len(q), POSTURES)).astype(int)])
+    return np.asarray(q[np.linspace(0, len(q) - 1, min(len(q), 60)).astype(int)])
 
 
 def placed_arm(data: RunData, lam: Array, q: Array) -> Skeleton:
@@ -134,7 +132,7 @@ def _view(
     learned = arms["learned"]
     size = float(np.ptp(np.vstack([arm.p for arm in arms.values()]), axis=0).max())
     for j, (p, axis) in enumerate(zip(learned.p, learned.axis, strict=True)):
-        tick = AXIS_SHARE * size * axis
+        tick = 0.06 * size * axis  # half length, of the arm's size
         ax.plot(*project(np.stack([p - tick, p + tick])).T, color=joint_color(j), linewidth=1.3)
         ax.plot(*project(p), color=joint_color(j), marker="o", markersize=3.6)
     ground(ax, project, 0.15 * size)

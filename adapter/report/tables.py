@@ -15,7 +15,7 @@ from adapter.gap.phrases import SHOWN_UNITS
 from adapter.judgement.priors import is_shown
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH
-from adapter.report.torque_panels import SHARE_ALONE, theta_started
+from adapter.report.learned_panels import SHARE_ALONE, theta_started
 from adapter.report.words import REFUSALS, count, number, with_doubt
 from adapter.runs.run_folder import RunData
 

@@ -17,10 +17,10 @@ from adapter.model.numbers import DASH
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.model.spatial import Array
 from adapter.report.gap_panels import fall_drawing
+from adapter.report.learned_panels import change_times, theta_started
 from adapter.report.skeleton import placed_arm, some_postures
 from adapter.report.style import Panel
 from adapter.report.tables import Table, by_column
-from adapter.report.torque_panels import change_times, theta_started
 from adapter.report.words import number, with_doubt
 from adapter.runs.run_folder import RunData
 from adapter.signals.validation import rms_of

@@ -11,8 +11,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from adapter.control.cell import Cell
-from adapter.control.settings import ExcitationSettings, SafetySettings
+from adapter.control.settings import Cell, ExcitationSettings, SafetySettings
 from adapter.errors import SettingsError
 from adapter.learning.settings import LearnerSettings
 from adapter.model.self_model import SelfModel, Tool

@@ -30,7 +30,6 @@ LOAD = np.array([2.0, 0.2, 0.2, 0.2])  # std of kg and kg m
 FRICTION_SHARE = 0.05  # std of a joint's friction, of its effort limit
 PROBABLE = 0.9
 CRUDE = 0.2  # of the torques, by which a way may be off: a load's inertia, a push that swells
-HAND_JOINTS = 3  # whose links a push at the hand and one there are alike
 SLOW = 0.02  # rad/s; slower, friction has no direction
 
 
@@ -90,7 +89,7 @@ def _ways(
         rubs = np.zeros((*q.shape, 1))
         rubs[:, j, 0] = -size[j] * np.where(np.abs(dq[:, j]) < SLOW, 0.0, np.sign(dq[:, j]))
         ways.append((Kind.FRICTION, rubs))
-    for j in range(n - HAND_JOINTS):
+    for j in range(n - 3):  # a push at the hand and one at its last links are alike
         ways.append((Kind.ARM, np.broadcast_to(np.diag(size)[:, : j + 1], (*q.shape, j + 1))))
     return ways
 

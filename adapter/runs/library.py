@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from adapter.discovery import Discovery
 from adapter.discovery import discover as discover_tree
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.export import robot_mjcf, robot_urdf
 from adapter.effects.kept import keep
-from adapter.effects.robots import read_robot
+from adapter.effects.robots import read_robot, robot_mjcf, robot_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.gap.result import GapResult

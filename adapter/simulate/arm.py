@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adapter.effects.export import to_urdf
+from adapter.effects.robots import to_urdf
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
 from adapter.simulate.effects import Effects

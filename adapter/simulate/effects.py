@@ -24,7 +24,7 @@ import numpy as np
 from adapter.effects.active import Active, active_effects, by_joint, with_bodies
 from adapter.effects.base import BodyEffect, JointTorque, Motion, SensorEffect, TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ, ByJoint, JointSignals, smooth_sign
-from adapter.effects.export import additions
+from adapter.effects.robots import additions
 from adapter.effects.torque import arm_between, moved_links
 from adapter.errors import ModelError, SettingsError
 from adapter.model.mjcf_text import MJCF_PLACES
@@ -32,8 +32,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS, URDF_PLACES
 from adapter.physics.rigid_arm import RigidArm
-from adapter.simulate.bristles import Bristles, with_bristles
-from adapter.simulate.friction import speed_change
+from adapter.simulate.friction import Bristles, speed_change, with_bristles
 
 # What the joints of a file have beside the bodies, by the format's name.
 FORMATS: dict[str, tuple[str, ...]] = {

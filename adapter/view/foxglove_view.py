@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.export import to_urdf
+from adapter.effects.robots import to_urdf
 from adapter.errors import MeansError, UsageError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.inertia import PARAMETERS

@@ -17,9 +17,9 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import base_parameters, frame_observability
-from adapter.realtime.loop_board import LoopTiming
 from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot
+from adapter.realtime.timing import LoopTiming
 from adapter.signals.records import StateLayout, stamp_of
 
 ROWS_A_LOOK = 8  # states of which the residual is computed, spread over those since the last look
@@ -232,7 +232,12 @@ class Onlooker:
         if snapshot is None or not snapshot.version or not np.isfinite(snapshot.lam).all():
             return self._frames
         if snapshot.learned >= self._frames_of:
-            self._frames = learned_frames(self.known.documented, snapshot)
+            documented, lam = self.known.documented, snapshot.lam
+            told = matrix_from_zxz(documented.lam[:, :3]), documented.lam[:, 3:]
+            seen = frame_observability(documented.tree, lam, documented.gravity)
+            R, p = seen.freedom.nearest(matrix_from_zxz(lam[:, :3]), lam[:, 3:], *told)
+            off = np.hstack([log_rotation(R @ np.swapaxes(told[0], 1, 2)), p - told[1]])
+            self._frames = LearnedFrames(R, p, off, snapshot.lam_std, ~seen.flags)
             self._frames_of = snapshot.learned + FRAMES_EVERY
         return self._frames
 
@@ -242,16 +247,6 @@ class Onlooker:
         arm = self.known.documented
         basis = base_parameters(arm.tree, arm.lam, arm.gravity).basis
         return np.einsum("ab,ab->a", basis, basis).reshape(-1, 10) > SHOWN_ALONE
-
-
-def learned_frames(documented: SelfModel, snapshot: Snapshot) -> LearnedFrames:
-    """See `LearnedFrames`."""
-    tree, lam = documented.tree, snapshot.lam
-    told = matrix_from_zxz(documented.lam[:, :3]), documented.lam[:, 3:]
-    seen = frame_observability(tree, lam, documented.gravity)
-    R, p = seen.freedom.nearest(matrix_from_zxz(lam[:, :3]), lam[:, 3:], *told)
-    off = np.hstack([log_rotation(R @ np.swapaxes(told[0], 1, 2)), p - told[1]])
-    return LearnedFrames(R, p, off, snapshot.lam_std, ~seen.flags)
 
 
 def untold(findings: list[dict[str, Any]], told: set[str]) -> Iterator[dict[str, Any]]:

@@ -12,6 +12,7 @@ machine's; `Origin`, where there is one, must be the same.
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
@@ -29,7 +30,6 @@ LISTENERS, CONNECTIONS = 8, 32  # at most: pages, and all that are open at a tim
 HEAD_S, SEND_S = 5.0, 5.0  # a request has to be whole, and a listener to take something, in this
 KEEP_ALIVE_S = 2.0
 SEND_BUFFER = 1 << 17  # bytes that wait for a slow listener: a second or two of frames
-RETRY_MS = 1500
 GOODBYE_S = 1.5
 STREAM = ("hello", "history", "news", "estimate", "timing", "frame")  # in this order
 HEADERS = {
@@ -53,16 +53,11 @@ def bind(port: int | None) -> socket.socket:
     """
     wanted = (DEFAULT_PORT, 0) if port is None else (port,)
     for candidate in wanted:
-        listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listening.bind((HOST, candidate))
-            listening.listen(16)
-            return listening
+            return socket.create_server((HOST, candidate), backlog=16)
         except OSError as error:
-            listening.close()
             if candidate == wanted[-1]:
-                reason = error.strerror or error
+                reason = os.strerror(error.errno) if error.errno else error
                 raise UsageError(
                     f"no page on port {candidate} ({reason}); choose another: --view PORT, or "
                     "--view 0 for any that is free"
@@ -279,7 +274,7 @@ class _Handler(BaseHTTPRequestHandler):
             for name, value in {**HEADERS, "Content-Type": "text/event-stream"}.items():
                 self.send_header(name, value)
             self.end_headers()
-            self.wfile.write(b"retry: %d\n\n" % RETRY_MS)
+            self.wfile.write(b"retry: %d\n\n" % 1500)  # ms
             seen: dict[str, int] = {}
             last = False
             while not last:

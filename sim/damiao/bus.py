@@ -18,13 +18,10 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from sim.damiao.codec import REFRESH, SERVICE_ID, data_frame
 
 DATAGRAM_BYTES = 4096
-OWN_FRAMES = 256  # that may be under way
 BUFFER_BYTES = 1 << 20  # 0.1 s of frames at 1 kHz; the kernel may grant less
-ON_THIS_MACHINE = 0  # hop limit: frames do not leave the machine
 INTERFACES = ("udp_multicast", "socketcan")
 MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
 MULTICAST_PORT = 43113  # python-can's default port
-ASK_S = 0.2
 
 
 class BoardsMulticastBus(UdpMulticastBus):
@@ -32,9 +29,9 @@ class BoardsMulticastBus(UdpMulticastBus):
 
     def __init__(self, channel: str, port: int, fd: bool) -> None:
         """Join a group. Raises can.CanInitializationError."""
-        super().__init__(channel, port=port, hop_limit=ON_THIS_MACHINE, fd=fd)
+        super().__init__(channel, port=port, hop_limit=0, fd=fd)  # frames do not leave the machine
         self._fd, self._to = fd, (channel, port)
-        self._own: deque[bytes] = deque(maxlen=OWN_FRAMES)
+        self._own: deque[bytes] = deque(maxlen=256)  # that may be under way
         self._socket = socket.socket(fileno=os.dup(self.fileno()))
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
@@ -126,7 +123,7 @@ def address_of(interface: str, channel: str, port: int, fd: bool) -> str:
 def check_alone(bus: can.BusABC, motor_id: int, reply_id: int, fd: bool) -> None:
     """Raise ValueError where somebody already answers for a motor on this bus."""
     bus.send(data_frame(SERVICE_ID, bytes([motor_id, 0, REFRESH, 0, 0, 0, 0, 0]), fd))
-    end = time.monotonic() + ASK_S
+    end = time.monotonic() + 0.2  # s
     while (left_s := end - time.monotonic()) > 0:
         message = bus.recv(left_s)
         if message is not None and message.arbitration_id == reply_id:

@@ -1,10 +1,11 @@
-"""Faults of simulated boards and their bus: when they strike, what they do.
+"""Faults of simulated boards and their bus, and what else the boards can be asked for.
 
-Their seconds count from the first frame to a motor.
+When faults strike, what they do; their seconds count from the first frame to a motor.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import heapq
 from collections import Counter
@@ -14,8 +15,11 @@ import can
 import numpy as np
 
 from sim.damiao import motor
+from sim.damiao.bus import INTERFACES, MULTICAST_GROUP, MULTICAST_PORT
 from sim.damiao.codec import BUS_ERROR, error_frame
-from sim.faults import JOINT, SECONDS, SHARE, Fault, Kind, Value, read_fault
+from sim.faults import JOINT, SECONDS, SHARE, Fault, Kind, Value, describe, read_fault
+from sim.options import add_served, options_of
+from sim.options import check as check_scenario
 
 OF_FRAMES = Value("a share of frames, from 0 to 1", SHARE.fits)
 MOTOR = Value("the number of a motor, from 1 to 7", JOINT.fits)
@@ -47,7 +51,6 @@ STATUS = {
     "overcurrent": motor.OVER_CURRENT,
     "overload": motor.OVERLOAD,
 }
-LATE_NS = 3_000_000
 SPIKE_RAD, JUMP_RAD = 0.5, 0.1
 HOT_C = 130.0
 FAULT_STREAM = 1 << 33  # keeps the draws of faults apart from those of truth and noise
@@ -128,7 +131,7 @@ class Outbox:
             self._corrupt(message)
         if strikes("late", now_s):
             self._count += 1
-            heapq.heappush(self._later, (now_ns + LATE_NS, self._count, message))
+            heapq.heappush(self._later, (now_ns + 3_000_000, self._count, message))
         elif strikes("reorder", now_s):
             self._behind.append(message)
         else:
@@ -167,3 +170,27 @@ class Outbox:
         else:
             del message.data[pick(size) :]
             message.dlc = len(message.data)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    words = f"default {INTERFACES[0]}"
+    add("--interface", choices=INTERFACES, default=INTERFACES[0], help=words)
+    words = f"multicast group (default {MULTICAST_GROUP}) or CAN interface, as in vcan0"
+    add("--channel", default=MULTICAST_GROUP, metavar="WHERE", help=words)
+    words = f"of the multicast group, default {MULTICAST_PORT}"
+    add("--port", type=int, default=MULTICAST_PORT, help=words)
+    add("--fd", type=int, choices=(0, 1), default=1, help="CAN FD, default 1")
+    add("--motors", choices=tuple(motor.SETS), default="panda", help="default panda")
+    faults = ", seconds from the first frame on:\n" + describe(KINDS)
+    of_set = "as in noise=real: a Panda's sensor noise beside the quantisation"
+    add_served(parser, faults, of_set)
+
+
+def check(args: argparse.Namespace) -> None:
+    """Raises ValueError for an arm or a fault that does not exist, or is no board's."""
+    check_scenario(args.scenario, options_of(args.set))
+    for text in args.fault:
+        if read_fault(text, KINDS | OF_HOSTS).name in OF_HOSTS:
+            raise ValueError(f"fault {text!r} strikes a host's own controller, not the boards")

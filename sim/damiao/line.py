@@ -34,6 +34,7 @@ from functools import lru_cache
 from typing import Protocol
 
 import can
+from can.util import dlc2len, len2dlc
 
 from sim.damiao.faults import Faults
 
@@ -47,7 +48,6 @@ CLASSIC_TAIL_BITS = 13  # checksum delimiter, acknowledge and its delimiter, end
 FD_TAIL_BITS = 12  # the same without the checksum delimiter, which is sent at the data rate
 CRC15 = 0x4599
 SHORT_CRC_BYTES = 16  # FD frames of more bytes have a checksum of 21 bits instead of 17
-FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 State = tuple[int, int]  # last bit (-1 before any), length of its run
 
@@ -106,8 +106,9 @@ def fd_bits(identifier: int, data: bytes, switch: bool) -> tuple[int, int]:
     """Bits of an FD frame at the arbitration rate and at the data rate, gap included."""
     # Start, id, two dominant bits (RRS, IDE), FDF, a dominant one (res), BRS.
     slow, state = stuffed(identifier << 5 | 0b00100 | switch, 17, (-1, 0))
-    size = next(size for size in FD_SIZES if size >= len(data))
-    fast, state = stuffed(FD_SIZES.index(size), 5, state)  # ESI and length code
+    code = len2dlc(len(data))
+    size = dlc2len(code)
+    fast, state = stuffed(code, 5, state)  # ESI and length code
     for byte in data.ljust(size, b"\0"):
         more, state = stuffed(byte, 8, state)
         fast += more

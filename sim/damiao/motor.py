@@ -27,8 +27,6 @@ READ_ONLY = frozenset({13, 14, 15, 16, 17, 18, 19, 20, 36, 50, 51, 52, 53, 54, 5
 TIMEOUT_UNIT_NS = 50_000  # one of two opinions on register 9; the other is 1 ms
 MIT_MODE = 1
 MODES = (1, 2, 3, 4)
-MAX_STANDARD_ID = 0x7FF
-CODE_5M = 9  # of CAN_BR
 # Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
 AIR_C = 25.0
 ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
@@ -193,7 +191,7 @@ class Motor:
 def _fits(register: int, value: float) -> bool:
     if register in INTEGER_REGISTERS:
         if register in (MST_ID, ESC_ID):
-            return 0 < value <= MAX_STANDARD_ID
+            return 0 < value <= 0x7FF  # a standard id
         return register != CTRL_MODE or value in MODES
     return math.isfinite(value) and (register not in (PMAX, VMAX, TMAX) or value > 0)
 
@@ -204,6 +202,7 @@ def _delivered(motor_id: int, reply_id: int, kind: MotorType, scale: FullScale) 
     values.update(dict.fromkeys(INTEGER_REGISTERS, 0))
     values.update({0: 15.0, 1: 1.0, OVER_TEMPERATURE: ROTOR_LIMIT_C, 3: 0.98, 29: 60.0, 30: 1.0})
     values.update({MST_ID: reply_id, ESC_ID: motor_id, TIMEOUT: 0, CTRL_MODE: MIT_MODE})
-    values.update({14: 5015, 15: motor_id, 16: 14, 20: kind.gear, CAN_BR: CODE_5M})
+    values.update({14: 5015, 15: motor_id, 16: 14, 20: kind.gear})
+    values[CAN_BR] = 9  # 5 Mbit/s
     values.update({PMAX: scale.pmax, VMAX: scale.vmax, TMAX: scale.tmax})
     return values

@@ -22,11 +22,10 @@ from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
 from sim.damiao.faults import HOT_C, JUMP_RAD, SPIKE_RAD, STATUS, Faults, Outbox
 from sim.damiao.motor import Motor, motor_set
 from sim.effects import ENCODER, TORQUE
-from sim.ending import Ending, sum_up
 from sim.engine import DriveLaw
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
-from sim.options import options_of
+from sim.options import Ending, options_of, sum_up
 from sim.scenarios import Scenario, build
 from sim.truth import Array
 

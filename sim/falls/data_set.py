@@ -26,15 +26,13 @@ import numpy as np
 import pybullet as bullet
 
 from sim.falls import fall
-from sim.falls.fall import RATE_HZ, FallRecord, babble
-from sim.falls.tree_truth import TreeLimits, TreeTruth, atlas
+from sim.falls.fall import RATE_HZ, FallRecord, TreeLimits, TreeTruth, babble
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
 PART = ".part"  # of files that are being written
 ABANDONED_S = 3600.0  # after which such a file is a killed run's
 FORMAT = 1  # of the files; a new one whenever what they hold is computed otherwise
-ROBOTS = {"atlas": atlas}
 CACHE_VARIABLE = "PANDA_ADAPTER_CACHE"  # environment variable, folder
 SIGNALS = tuple(item.name for item in fields(FallRecord))
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
@@ -192,7 +190,7 @@ class FallData:
 
 
 def data_set(
-    robot: str | TreeTruth = "atlas",
+    robot: TreeTruth,
     trajectories: int = TRAJECTORIES,
     flight: Flight = Flight(),
     folder: str | Path | None = None,
@@ -202,7 +200,7 @@ def data_set(
     """Trajectories of a robot that falls and babbles; those that are not there yet are made.
 
     Args:
-        robot: `atlas`, or any tree.
+        robot: the tree, as `fall.atlas`.
         trajectories: how many; a longer set begins with the same ones.
         flight: how it falls.
         folder: for the files; `cache_folder()` where None.
@@ -210,14 +208,10 @@ def data_set(
         processes: at work at once; of no influence on the data.
 
     Raises:
-        ValueError: an unknown robot, a count that is not above 0.
+        ValueError: a count that is not above 0.
         RuntimeError: a motion that leaves the joints' ranges, or a worker process that failed;
             what it said is in the message.
     """
-    if isinstance(robot, str):
-        if robot not in ROBOTS:
-            raise ValueError(f"no robot {robot!r}; have: {', '.join(ROBOTS)}, or a TreeTruth")
-        robot = ROBOTS[robot]()
     if trajectories < 1 or processes < 1:
         raise ValueError("trajectories and processes must be 1 or more")
     place = cache_folder() if folder is None else Path(folder)

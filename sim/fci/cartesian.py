@@ -7,10 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.compiled import compiled
-from sim.dynamics import Frames, cross, end_effector
+from sim.dynamics import Frames, compiled, cross, end_effector
 from sim.fci.codec import TICK_S, Generator, RobotCommand
-from sim.fci.joint_limits import ROOM, LimitErrors, broken
 from sim.truth import Array, Limits, turn_about
 
 ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
@@ -19,17 +17,16 @@ ELBOW_TOLERANCE = 1e-2  # rad, chosen
 REACHED = 1e-3  # m and rad, so far the joints may be from a pose; else it is out of reach
 RIGID = 1e-4  # so far R^T R of a pose may be from the identity
 ELBOW_SPEED = 2.175  # rad/s (Franka FCI documentation)
+JERK_PER_ACCELERATION = 500.0  # 1/s: 7500 rad/s³ at 15 rad/s² (Franka FCI documentation)
+# Differences over 1 ms of positions that the client had as f32 are off by up to 500 rad/s³
+# (and 2e-4 rad/s), which a motion along its limits shall not be blamed for.
+ROOM, SPEED_ROOM = 1.1, 1.001
 
 START_ELBOW = "cartesian_motion_generator_start_elbow_invalid"
 START_SIGN = "start_elbow_sign_inconsistent"
 SIGN = "cartesian_motion_generator_elbow_sign_inconsistent"
 ELBOW = "cartesian_motion_generator_elbow_limit_violation"
-JOINTS_BROKEN = LimitErrors(
-    "cartesian_motion_generator_joint_position_limits_violation",
-    "cartesian_motion_generator_joint_velocity_limits_violation",
-    "cartesian_motion_generator_joint_velocity_discontinuity",
-    "cartesian_motion_generator_joint_acceleration_discontinuity",
-)
+OF_JOINTS = "cartesian_motion_generator_joint"  # how errors of the joints' own motion begin
 
 Reach = Callable[[Array, Array, float], tuple[Array, float]]
 
@@ -130,10 +127,10 @@ class CartesianMotion:
                 return error
         q, missed = self._reach(self.q, pose, elbow)
         if not missed <= REACHED:
-            return JOINTS_BROKEN.position
+            return f"{OF_JOINTS}_position_limits_violation"
         before = self.q, self.dq, self.ddq
         self._take_joints(q)
-        found = broken(self._limits, JOINTS_BROKEN, q, (self.dq, self.ddq, before[2]))
+        found = broken(self._limits, OF_JOINTS, q, (self.dq, self.ddq, before[2]))
         if found is not None:
             self.q, self.dq, self.ddq = before
             return found
@@ -143,6 +140,28 @@ class CartesianMotion:
     def _take_joints(self, q: Array) -> None:
         dq = (q - self.q) / TICK_S
         self.q, self.dq, self.ddq = q, dq, (dq - self.dq) / TICK_S
+
+
+def broken(limits: Limits, motion: str, q: Array, rates: tuple[Array, ...]) -> str | None:
+    """The error of the first limit that a joint motion does not keep; a NaN keeps none.
+
+    Args:
+        limits: of the joints.
+        motion: how names of its errors begin.
+        q: (n,) rad; rates: dq, ddq at this tick and ddq at the one before, (n,) each.
+    """
+    dq, ddq, before = rates
+    if not ((q >= limits.lower) & (q <= limits.upper)).all():
+        return f"{motion}_position_limits_violation"
+    slowest, fastest = limits.speeds(q)
+    if not ((dq >= slowest * SPEED_ROOM) & (dq <= fastest * SPEED_ROOM)).all():
+        return f"{motion}_velocity_limits_violation"
+    most = limits.acceleration * ROOM
+    if not (np.abs(ddq) <= most).all():
+        return f"{motion}_velocity_discontinuity"
+    if not (np.abs(ddq - before) <= JERK_PER_ACCELERATION * TICK_S * most).all():
+        return f"{motion}_acceleration_discontinuity"
+    return None
 
 
 def within(value: Array, most: tuple[float, float]) -> bool:

@@ -346,11 +346,6 @@ def reply(request: Request, status: Status, version: int, rest: bytes = b"") -> 
     return HEADER.pack(request.number, request.ident, size) + bytes((code,)) + rest
 
 
-def connect_reply(request: Request, status: Status, version: int, said_version: int) -> bytes:
-    """The reply to Connect; `said_version` is what the server calls itself."""
-    return reply(request, status, version, struct.pack("<H", said_version))
-
-
 def limit_reply(request: Request, version: int) -> bytes:
     """The reply to GetCartesianLimit: a limit that is not active."""
     return reply(request, Status.OK, version, bytes(_LIMIT_REPLY))

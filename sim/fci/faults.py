@@ -1,16 +1,32 @@
-"""Faults of the simulated robot, and what they do.
+"""What the simulated robot can be asked for; its faults, and what they do.
 
-They change measured values, datagrams or the robot itself.
+Faults change measured values, datagrams or the robot itself.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from sim.faults import COUNT, JOINT, NAME, NOTHING, SECONDS, VERSION, Fault, Kind
-from sim.fci.codec import ERRORS, JOINTS, TICK_S, Floats, StateFrame
+from sim.faults import (
+    COUNT,
+    JOINT,
+    NAME,
+    NOTHING,
+    SECONDS,
+    VERSION,
+    Fault,
+    Kind,
+    describe,
+    read_fault,
+)
+from sim.fci.codec import ERRORS, HOST, JOINTS, PORT, TICK_S, VERSIONS, Floats, StateFrame
+from sim.fci.gripper import WIDEST
+from sim.options import add_served, options_of
+from sim.options import check as check_scenario
 
 KINDS = {
     "drop": Kind("states are lost"),
@@ -30,11 +46,10 @@ KINDS = {
     "clock": Kind("message ids jump by so many", COUNT, "10000"),
     "version": Kind("the server says that it speaks this version", VERSION, "7", timed=False),
 }
-LATEST_TICKS = 5
-FLIPPED_BYTES = 8  # at most
 SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
 JUMP_RAD = 0.05
 OF_DATAGRAMS = ("drop", "late", "repeat", "reorder", "corrupt")
+ROBOT = {5: "panda", 10: "fr3"}  # by protocol
 AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
 
 
@@ -115,7 +130,7 @@ class Spoiler:
                 self._held, copies = copies[0], []
             else:
                 if fault.name == "late":
-                    when = tick + int(self._rng.integers(1, LATEST_TICKS + 1))
+                    when = tick + int(self._rng.integers(1, 6))
                     self._later.extend((when, item) for item in copies)
                 copies = []
         return copies
@@ -124,7 +139,7 @@ class Spoiler:
         if self._rng.random() < 0.5:
             return data[: self._rng.integers(len(data))]
         changed = bytearray(data)
-        for at in self._rng.integers(len(data), size=self._rng.integers(1, FLIPPED_BYTES + 1)):
+        for at in self._rng.integers(len(data), size=self._rng.integers(1, 9)):
             changed[at] ^= int(self._rng.integers(1, 256))
         return bytes(changed)
 
@@ -143,3 +158,34 @@ class Spoiler:
         hit = bool(self._rng.random() < fault.value)
         self.counts[fault.name] += hit
         return hit
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("--port", type=int, default=PORT, help=f"TCP port on {HOST}; clients know only {PORT}")
+    words = "TCP port of the gripper; 1338, which clients know, where --port is 1337, else none"
+    add("--gripper-port", type=int, default=None, metavar="PORT", help=words)
+    words = "width of what lies between the gripper's fingers; 0 is nothing"
+    add("--object", type=float, default=0.0, metavar="M", help=words)
+    add("--protocol", type=int, choices=VERSIONS, default=5, help="5 Panda (FER), 10 FR3")
+    add("--core", type=int, default=None, help="processor to stay on")
+    words = "wait so long for a late command while the world stands still; no robot does"
+    add("--patience", type=float, default=0.0, metavar="S", help=words)
+    add_served(parser, ":\n" + describe(KINDS), default="real_drives")
+
+
+def chosen(args: argparse.Namespace) -> dict[str, Any]:
+    """The scenario's options; the arm is the one that speaks the protocol, if none is named."""
+    return {"robot": ROBOT[args.protocol]} | options_of(args.set)
+
+
+def check(args: argparse.Namespace) -> None:
+    """Raises ValueError for an arm, a fault or a patience that does not exist."""
+    if not 0.0 <= args.patience < float("inf"):
+        raise ValueError(f"--patience takes seconds from 0 up, got {args.patience}")
+    if not 0.0 <= args.object <= WIDEST:
+        raise ValueError(f"--object takes 0 to {WIDEST} m, got {args.object}")
+    check_scenario(args.scenario, chosen(args))
+    for text in args.fault:
+        read_fault(text, KINDS)

@@ -20,10 +20,8 @@ STATE = struct.Struct("<IddBH")  # id, width and greatest width (m), grasped, te
 PAYLOADS = {0: "<HH", 1: "", 2: "<5d", 3: "<2d", 4: ""}  # by command
 STATE_PERIOD_S = 0.01  # chosen; the hand's own is not published
 WIDEST = 0.08  # m between the fingers
-START_WIDTH = 0.04
 HOMING_SPEED, FASTEST = 0.05, 0.1  # m/s; the first chosen, the second of the data sheet
 STRONGEST = 140.0  # N, data sheet
-TEMPERATURE = 30  # °C
 NOTHING = 0.0  # m, the width of what lies between the fingers where nothing does
 
 
@@ -59,7 +57,7 @@ class Fingers:
 
     def __init__(self, thing: float = NOTHING) -> None:
         self._thing = thing
-        self.width, self.grasped = START_WIDTH, False
+        self.width, self.grasped = 0.04, False
         self._goals: list[tuple[float, float]] = []  # width and speed, one after the other
         self._accepted: tuple[float, float] | None = None  # of a grasp, least and greatest width
         self._at = 0.0
@@ -136,15 +134,8 @@ class GripperServer:
 
     def __init__(self, port: int = PORT, thing: float = NOTHING) -> None:
         self.fingers, self.clients = Fingers(thing), 0
-        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._listener.bind((HOST, port))
-        except OSError:
-            self._listener.close()
-            raise
+        self._listener = socket.create_server((HOST, port))
         self._listener.setblocking(False)
-        self._listener.listen()
         self.port: int = self._listener.getsockname()[1]
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind((HOST, 0))
@@ -169,7 +160,7 @@ class GripperServer:
             self._due_s = now_s + STATE_PERIOD_S
             self._message_id += 1
             hand = self.fingers
-            state = (self._message_id, hand.width, WIDEST, hand.grasped, TEMPERATURE)
+            state = (self._message_id, hand.width, WIDEST, hand.grasped, 30)  # °C
             with suppress(OSError):  # nobody listens there any more
                 self._udp.sendto(STATE.pack(*state), self._states_to)
 

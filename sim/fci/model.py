@@ -31,7 +31,6 @@ _HEAD = """#include <math.h>
 #include <string.h>
 #define N 7
 """
-COMPILERS = ("cc", "gcc", "clang")
 OPTIONS = ("-O2", "-shared", "-fPIC", "-x", "c", "-", "-lm")
 TIMEOUT_S = 60.0
 
@@ -68,7 +67,7 @@ def _frames() -> list[str]:
 
 def model_library(truth: Truth) -> bytes | None:
     """The library's bytes; None without a C compiler, or where it does not build for x64 Linux."""
-    compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
+    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     if compiler is None or (platform.system(), platform.machine()) != ("Linux", "x86_64"):
         return None
     source = model_source(truth)

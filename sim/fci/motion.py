@@ -5,19 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from sim.fci.arm import Arm
-from sim.fci.cartesian import HAND_LIMITS, CartesianMotion
+from sim.fci.cartesian import HAND_LIMITS, CartesianMotion, broken
 from sim.fci.codec import JOINTS, TICK_S, ControllerMode, Generator, Request, RobotCommand
-from sim.fci.joint_limits import LimitErrors, broken
 from sim.truth import Array, Limits
 
 START_TOLERANCE = 1e-3  # rad, first position from q_d; the robot's own is not published
-
-BROKEN = LimitErrors(
-    "joint_motion_generator_position_limits_violation",
-    "joint_motion_generator_velocity_limits_violation",
-    "joint_motion_generator_velocity_discontinuity",
-    "joint_motion_generator_acceleration_discontinuity",
-)
 WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
 MOST_MISSED = 20  # in a row, then communication_constraints_violation
 # Until the first command the client still changes over from replies to states. Chosen here: longer
@@ -60,7 +52,7 @@ class DesiredMotion:
 
     def _go(self, q: Array, dq: Array) -> str | None:
         ddq = (dq - self.dq) / TICK_S
-        found = broken(self._limits, BROKEN, q, (dq, ddq, self.ddq))
+        found = broken(self._limits, "joint_motion_generator", q, (dq, ddq, self.ddq))
         if found is None:
             self.q, self.dq, self.ddq, self._fresh = q, dq, ddq, False
         return found

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.fci.arm import Arm
+from sim.fci.arm import Arm, Settings
 from sim.fci.cartesian import ELBOW_FLIP, CartesianMotion
 from sim.fci.codec import (
     ERRORS,
@@ -22,7 +22,6 @@ from sim.fci.codec import (
     reply,
 )
 from sim.fci.motion import CommandedMotion, DesiredMotion, allowed
-from sim.fci.settings import Settings
 from sim.scenarios import Scenario
 from sim.truth import Array
 

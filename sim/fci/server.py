@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 import select
 import socket
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from sim.ending import Ending, sum_up
 from sim.faults import read_fault
 from sim.fci.clock import Ticks, undisturbed
 from sim.fci.codec import (
@@ -24,17 +25,16 @@ from sim.fci.codec import (
     RequestReader,
     RobotCommand,
     Status,
-    connect_reply,
     limit_reply,
     read_command,
     reply,
 )
-from sim.fci.faults import KINDS, Spoiler
+from sim.fci.faults import KINDS, Spoiler, chosen
 from sim.fci.gripper import PORT as GRIPPER_PORT
 from sim.fci.gripper import GripperServer
 from sim.fci.model import model_library, robot_urdf
-from sim.fci.options import chosen
 from sim.fci.robot import Reporter, Robot
+from sim.options import Ending, sum_up
 from sim.scenarios import Scenario, build
 
 CHUNK = 4096  # bytes at a time; the longest request has 428
@@ -42,7 +42,6 @@ MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it i
 QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
 IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
 IDLE_WITH_HAND_S = 0.01
-HAND_TICKS = 10  # between two looks at the gripper's client
 
 
 class ClientSession:
@@ -254,7 +253,7 @@ class FciServer:
                     if not self._session.open:
                         self._drop()
                 self._accept()
-                if self.hand is not None and self._tick % HAND_TICKS == 0:
+                if self.hand is not None and self._tick % 10 == 0:
                     self.hand.poll()
 
     def summary(self) -> dict[str, Any]:
@@ -365,11 +364,11 @@ class FciServer:
         assert session is not None
         if request.name == "Connect":
             wanted, port = request.connect_terms()
-            if wanted != self._says or port == 0:
-                return connect_reply(request, Status.INCOMPATIBLE, version, self._says)
-            if not session.connected:
+            agreed = wanted == self._says and port != 0
+            if agreed and not session.connected:
                 session.begin_states(port)
-            return connect_reply(request, Status.OK, version, self._says)
+            status = Status.OK if agreed else Status.INCOMPATIBLE
+            return reply(request, status, version, struct.pack("<H", self._says))
         if not session.connected:
             raise BadRequest(f"{request.name} before Connect")
         if request.name == "GetCartesianLimit":
@@ -421,4 +420,5 @@ def _hand(args: argparse.Namespace) -> GripperServer | None:
 
 
 def _taken(port: int, error: OSError) -> str:
-    return f"port {port} of {HOST} cannot be used ({error.strerror}); stop what uses it"
+    why = os.strerror(error.errno or 0)
+    return f"port {port} of {HOST} cannot be used ({why}); stop what uses it"

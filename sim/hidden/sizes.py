@@ -18,41 +18,16 @@ SECONDS = 20.0
 WIDER = np.sqrt(3.0)  # either end of a range of sizes is further out by this
 WRIST = 5  # joints from here on (counted from 1) get WRIST_SHARE of a torque
 WRIST_SHARE = 0.4
-START_S = (5.0, 15.0)  # of effects that begin mid-recording
 CONTACT_S = (1.0, 3.0)  # how long a contact lasts
-LATE_SHARE = {"payload": 0.5, "torque_offset": 0.25, "coulomb_friction": 0.25}
-WHOLE_ARM_DELAY_SHARE = 0.5
 
+LATE_SHARE = {"payload": 0.5, "torque_offset": 0.25, "coulomb_friction": 0.25}
 COULOMB = (0.3, 2.0)  # N m
 VISCOUS = (0.1, 1.0)  # N m s/rad
-ASYMMETRY = (1.3, 3.0)  # larger over smaller Fc
 STRIBECK_RATIO, STRIBECK_SPEED = (1.3, 3.0), (0.05, 0.2)  # Fs/Fc; rad/s
-LOAD_SHARE = (0.02, 0.1)
-ARMATURE = (0.05, 0.3)  # kg m2
-STIFFNESS = (3000.0, 20000.0)  # N m/rad
-PLAY = (2e-3, 10e-3)  # rad
 RIPPLE = (0.1, 0.5)  # N m
-RIPPLE_ORDERS = (1, 2, 3, 4, 6, 8, 10, 12)  # per turn
-SPRING = (0.2, 2.0)  # N m/rad
-OFFSET = (0.2, 1.0)  # N m
-GAIN = (0.03, 0.1)
 ENCODER_OFFSET, ENCODER_RIPPLE = (5e-3, 20e-3), (2e-3, 10e-3)  # rad
-DELAY = (1e-3, 5e-3)  # s
-BRISTLE = (5e-4, 1e-2)  # rad over which friction winds up
 LOW_PASS, LOW_PASS_POLES = (0.015, 0.03), (0.75, 1.0)  # d, s; c / d^2: two equal poles to one
-MASS = (0.3, 3.0)  # kg
-BODY_M = (0.02, 0.06)  # half side of the box that a payload is
 BEYOND_M, ASIDE_M = (0.02, 0.1), 0.05  # its centre from the flange, along and across
-TILT = (np.radians(0.5), np.radians(3.0))
-CONTACT_N = (5.0, 30.0)
-DRIFT = (0.02, 0.1)  # N m/s
-LINK_ERROR = (0.15, 0.4)  # of a link's mass, or of its centre's distance
-DRAG = (0.3, 1.5)  # N m s2/rad2, torque with the square of the speed
-CUBIC = (0.5, 3.0)  # N m/rad3
-SINE_HZ = (0.7, 4.0)
-CROSSTALK = (0.03, 0.1)  # of another joint's torque
-DEADBAND = (0.15, 0.6)  # N m
-SATURATION = (0.6, 1.2)  # of the joint's effort limit
 
 Numbers = dict[str, float | list[float]]
 Draw = Callable[[np.random.Generator, int, Truth], float]  # of a joint (from 1) of an arm
@@ -110,7 +85,7 @@ def _phase(rng: np.random.Generator, joint: int, arm: Truth) -> float:
 
 
 def _order(rng: np.random.Generator, joint: int, arm: Truth) -> float:
-    return float(rng.choice(RIPPLE_ORDERS))
+    return float(rng.choice((1, 2, 3, 4, 6, 8, 10, 12)))  # per turn
 
 
 def _rest(reach: float) -> Draw:
@@ -119,7 +94,7 @@ def _rest(reach: float) -> Draw:
 
 
 def _asymmetric(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    large, ratio = torque_size(rng, joint, COULOMB), log_uniform(rng, ASYMMETRY)
+    large, ratio = torque_size(rng, joint, COULOMB), log_uniform(rng, (1.3, 3.0))
     pair = (large, large / ratio) if rng.random() < 0.5 else (large / ratio, large)
     return {"Fc_pos": pair[0], "Fc_neg": pair[1]}
 
@@ -136,8 +111,9 @@ def box_moments(m: float, half: Array) -> Array:
 
 
 def _payload(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    m = wide(rng, MASS)
-    xx, yy, zz = box_moments(m, rng.uniform(*BODY_M, 3)).tolist()
+    m = wide(rng, (0.3, 3.0))  # kg
+    # a box of these half sides, m
+    xx, yy, zz = box_moments(m, rng.uniform(0.02, 0.06, 3)).tolist()
     x, y = rng.uniform(-ASIDE_M, ASIDE_M, 2).tolist()
     z = FLANGE_M + float(rng.uniform(*BEYOND_M))
     return {"m": m, "cx": x, "cy": y, "cz": z, "inertia": [xx, 0.0, 0.0, yy, 0.0, zz]}
@@ -147,7 +123,7 @@ def _link_inertia(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     """A link that weighs more or less by a share, all ten numbers in proportion, or whose centre
     is elsewhere (a body of the same inertia about its centre, moved)."""
     theta = arm.theta[joint - 1]
-    share = wide(rng, LINK_ERROR) * _sign(rng)
+    share = wide(rng, (0.15, 0.4)) * _sign(rng)  # of a link's mass, or of its centre's distance
     if rng.random() < 0.5:
         return {"dtheta": (share * theta).tolist()}
     m, c = theta[0], theta[1:4] / theta[0]
@@ -158,12 +134,12 @@ def _link_inertia(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
 
 
 def _tilt(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    size, way = wide(rng, TILT), rng.uniform(0, 2 * np.pi)
+    size, way = wide(rng, (np.radians(0.5), np.radians(3.0))), rng.uniform(0, 2 * np.pi)
     return {"rx": float(size * np.cos(way)), "ry": float(size * np.sin(way))}
 
 
 def _contact(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    x, y, z = (wide(rng, CONTACT_N) * direction(rng)).tolist()
+    x, y, z = (wide(rng, (5.0, 30.0)) * direction(rng)).tolist()  # N
     return {"fx": x, "fy": y, "fz": z, "mx": 0.0, "my": 0.0, "mz": 0.0}
 
 
@@ -173,7 +149,8 @@ def _low_pass(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
 
 
 def _saturation(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    return {"s": log_uniform(rng, SATURATION) * float(arm.limits.effort[joint - 1])}
+    # a share of the joint's effort limit
+    return {"s": log_uniform(rng, (0.6, 1.2)) * float(arm.limits.effort[joint - 1])}
 
 
 # Name -> (joints it may sit on, how its numbers are drawn); no joints: acts on the whole arm.
@@ -182,36 +159,36 @@ CATALOGUE: dict[str, tuple[tuple[int, ...], Maker]] = {
     "coulomb_friction": (ALL, _of(Fc=_torque(COULOMB))),
     "asymmetric_friction": (ALL, _asymmetric),
     "stribeck_friction": (ALL, _stribeck),
-    "load_dependent_friction": (ALL, _of(Fl=_plain(LOAD_SHARE))),
-    "motor_inertia": (ALL, _of(B=_torque(ARMATURE))),
-    "joint_elasticity": (ALL, _of(k=_plain(STIFFNESS))),
-    "backlash": (ALL, _of(b=_plain(PLAY))),
+    "load_dependent_friction": (ALL, _of(Fl=_plain((0.02, 0.1)))),
+    "motor_inertia": (ALL, _of(B=_torque((0.05, 0.3)))),  # kg m2
+    "joint_elasticity": (ALL, _of(k=_plain((3000.0, 20000.0)))),  # N m/rad
+    "backlash": (ALL, _of(b=_plain((2e-3, 10e-3)))),  # rad
     "torque_ripple": (ALL, _of(n=_order, phase=_phase, a=_torque(RIPPLE))),
-    "joint_spring": (ALL, _of(q0=_rest(0.5), k=_torque(SPRING))),
-    "torque_offset": (ALL, _of(o=_torque(OFFSET, signed=True))),
-    "torque_gain": (ALL, _of(g=_plain(GAIN, signed=True))),
+    "joint_spring": (ALL, _of(q0=_rest(0.5), k=_torque((0.2, 2.0)))),  # N m/rad
+    "torque_offset": (ALL, _of(o=_torque((0.2, 1.0), signed=True))),  # N m
+    "torque_gain": (ALL, _of(g=_plain((0.03, 0.1), signed=True))),
     "encoder_offset": (ALL, _of(o=_plain(ENCODER_OFFSET, signed=True))),
     "encoder_ripple": (ALL, _of(phase=_phase, a=_plain(ENCODER_RIPPLE))),
-    "signal_delay": (ALL, _of(d=_plain(DELAY))),
+    "signal_delay": (ALL, _of(d=_plain((1e-3, 5e-3)))),  # s
     "payload": ((), _payload),
     "link_inertia": ((2, 3, 4, 5, 6, 7), _link_inertia),
     "base_tilt": ((), _tilt),
     "external_wrench": ((), _contact),
-    "friction_drift": (ALL, _of(dFc=_torque(DRIFT))),
-    "bristle_friction": (ALL, _of(Fc=_torque(COULOMB), s0=_plain(BRISTLE))),
+    "friction_drift": (ALL, _of(dFc=_torque((0.02, 0.1)))),  # N m/s
+    "bristle_friction": (ALL, _of(Fc=_torque(COULOMB), s0=_plain((5e-4, 1e-2)))),  # N m, rad
     "torque_filter": (ALL, _low_pass),
 }
 
 # Effects that are in no list, by the names under which `sim.effects` simulates them.
 OUTSIDE: dict[str, tuple[tuple[int, ...], Maker]] = {
-    "x_quadratic_drag": (ALL, _of(c=_torque(DRAG))),
-    "x_cubic_spring": (ALL, _of(q0=_rest(0.3), c=_torque(CUBIC))),
+    "x_quadratic_drag": (ALL, _of(c=_torque((0.3, 1.5)))),  # N m s2/rad2
+    "x_cubic_spring": (ALL, _of(q0=_rest(0.3), c=_torque((0.5, 3.0)))),  # N m/rad3
     "x_position_friction": (ALL, _of(A=_torque(COULOMB), phase=_phase)),
-    "x_sine_disturbance": (ALL, _of(phase=_phase, a=_torque(RIPPLE), f=_exact(SINE_HZ))),
+    "x_sine_disturbance": (ALL, _of(phase=_phase, a=_torque(RIPPLE), f=_exact((0.7, 4.0)))),  # Hz
     "x_velocity_ripple": (ALL, _of(phase=_phase, n=_order, a=_torque(VISCOUS))),
     "x_cross_viscous": (ALL, _of(c=_torque(VISCOUS))),
-    "x_torque_crosstalk": (ALL, _of(share=_plain(CROSSTALK, signed=True))),
-    "x_torque_deadband": (ALL, _of(w=_torque(DEADBAND))),
+    "x_torque_crosstalk": (ALL, _of(share=_plain((0.03, 0.1), signed=True))),
+    "x_torque_deadband": (ALL, _of(w=_torque((0.15, 0.6)))),  # N m
     "x_torque_saturation": ((2, 4), _saturation),
 }
 
@@ -224,13 +201,13 @@ def draw_effect(rng: np.random.Generator, name: str, arm: Truth) -> Effect:
     on: tuple[int, ...] = (joint,) if joints else ()
     if name in PAIRS:
         on = (int(rng.choice([j for j in joints if j != joint])), joint)
-    if name == "signal_delay" and rng.random() < WHOLE_ARM_DELAY_SHARE:
+    if name == "signal_delay" and rng.random() < 0.5:
         on = ()
     return Effect(name, on, numbers, _interval(rng, name))
 
 
 def _interval(rng: np.random.Generator, name: str) -> tuple[float, float | None] | None:
-    start, length = float(rng.uniform(*START_S)), float(rng.uniform(*CONTACT_S))
+    start, length = float(rng.uniform(5.0, 15.0)), float(rng.uniform(*CONTACT_S))
     late = rng.random() < LATE_SHARE.get(name, 0.0)
     if name == "external_wrench":
         return start, start + length
@@ -241,7 +218,6 @@ def _interval(rng: np.random.Generator, name: str) -> tuple[float, float | None]
 
 RUB_COULOMB, RUB_VISCOUS = (0.2, 1.0), (0.05, 0.5)  # N m, N m s/rad
 RUB_STICTION, RUB_SPEED = (1.0, 1.6), (0.02, 0.1)  # of Coulomb's; rad/s
-RUB_RAD = (0.3e-3, 4e-3)  # over which a joint winds up
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +263,7 @@ def draw_bristles(rng: np.random.Generator, n: int) -> Bristles:
         coulomb * rng.uniform(*RUB_STICTION, n),
         rng.uniform(*RUB_SPEED, n),
         share * sizes(rng, RUB_VISCOUS, n),
-        sizes(rng, RUB_RAD, n),
+        sizes(rng, (0.3e-3, 4e-3), n),  # rad over which a joint winds up
         rng.uniform(-1, 1, n),
     )
 

@@ -39,7 +39,6 @@ from sim.urdf_writer import urdf
 FORMAT, VERSION = "panda-adapter/hidden-truth", 1
 KINDS = ("null", "single", "pair", "outside")
 SHARES = (0.25, 0.40, 0.25, 0.10)
-COMMANDS_SHARE = 0.5  # of the recordings have /joint_commands
 MODEL_ERROR = (0.005, 0.05)  # rms error of the nominal model's inertial numbers, of their sizes
 FRICTION_SHARE = 0.4  # of the trials have friction in every joint beside what is hidden
 DISTURBANCE_NM = (0.02, 0.08)  # rms; less on joints 5 to 7
@@ -186,7 +185,7 @@ def draw(
         kind=kind,
         disturbance_nm=wrist_shares(arm.n) * rng.uniform(*DISTURBANCE_NM, arm.n),
         disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
-        commands=bool(rng.random() < COMMANDS_SHARE),
+        commands=bool(rng.random() < 0.5),  # half of the recordings have /joint_commands
         effects=_effects(rng, kind, arm, effect, RUBS if rubs or sticks else ())
         + tuple(  # in every joint
             Effect("coulomb_friction", (j,), {"Fc": torque_size(rng, j, COULOMB)})

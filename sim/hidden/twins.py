@@ -27,14 +27,10 @@ STREAM, NOISE_STREAM = 36, 37  # apart from those of the other trials
 STEP_S = 1e-3  # of the motion that is recorded
 SECONDS = (2.0, 7.0)
 MODEL_ERROR, LAST_ERROR = (0.05, 0.3), 0.05  # of links 1 to n - 1; of the last one
-BARE_SHARE = 0.3  # of the twins carry nothing
 LOAD_KG = (0.3, 4.4)
 LOAD_BEYOND_M, LOAD_ASIDE_M, LOAD_HALF_M = (0.0, 0.15), 0.05, (0.02, 0.06)
 OFFSET_NM = 0.3
 DISTURBANCE_NM, DISTURBANCE_HZ = (0.05, 0.3), (0.2, 5.0)
-SENSOR_HZ = (15.0, 80.0)  # where the torque sensor's low-pass begins
-DQ_LATE_S = (0.0, 2.7e-3)
-REPEATS = (0.06, 0.37)
 HOLES, HOLE_S = (2, 8), (17e-3, 53e-3)
 PERIOD_S, LONG_PERIOD_S, LONG_SHARE = (0.7e-3, 1.3e-3), (1.3e-3, 8.8e-3), 0.02
 MOTIONS = ("points", "sines", "hand")
@@ -115,8 +111,8 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
         kind=kind,
         friction=draw_bristles(rng, n),
         offset=wrist_shares(n) * OFFSET_NM * rng.standard_normal(n),
-        sensor_hz=sizes(rng, SENSOR_HZ, n),
-        dq_late_s=float(rng.uniform(*DQ_LATE_S)),
+        sensor_hz=sizes(rng, (15.0, 80.0), n),  # where the torque sensor's low-pass begins
+        dq_late_s=float(rng.uniform(0.0, 2.7e-3)),
         motion_number=motion,
         load_number=load,
     )
@@ -124,7 +120,7 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
 
 def _held(rng: np.random.Generator) -> tuple[float, Array, Array]:
     """What the hand holds, a box: mass kg, (10,) about the last link's origin, centre (3,) m."""
-    mass = 0.0 if rng.random() < BARE_SHARE else log_uniform(rng, LOAD_KG)
+    mass = 0.0 if rng.random() < 0.3 else log_uniform(rng, LOAD_KG)  # some carry nothing
     x, y = rng.uniform(-LOAD_ASIDE_M, LOAD_ASIDE_M, 2)
     c = np.array([x, y, FLANGE_M + rng.uniform(*LOAD_BEYOND_M)])
     xx, yy, zz = box_moments(mass, rng.uniform(*LOAD_HALF_M, 3)).tolist()
@@ -190,6 +186,6 @@ def _stamps(rng: np.random.Generator, end_s: float) -> tuple[Array, NDArray[np.i
     steps[holes] += rng.uniform(*HOLE_S, len(holes))
     stamps = np.cumsum(steps)
     stamps = stamps[stamps < end_s]
-    fresh = rng.random(len(stamps)) >= rng.uniform(*REPEATS)
+    fresh = rng.random(len(stamps)) >= rng.uniform(0.06, 0.37)
     fresh[0] = True
     return stamps, np.maximum.accumulate(np.where(fresh, np.arange(len(stamps)), 0))

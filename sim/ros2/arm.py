@@ -28,10 +28,9 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from drivers.interface import DriverError
-from sim.ending import Ending, sum_up
 from sim.faults import Fault, read_fault
 from sim.fci.clock import PRIORITY, Ticks, undisturbed
-from sim.options import options_of
+from sim.options import Ending, options_of, sum_up
 from sim.ros2.options import KINDS
 from sim.scenarios import Scenario, build
 from sim.truth import Truth

@@ -10,7 +10,6 @@ from sim.options import add_served, options_of
 from sim.options import check as check_scenario
 
 DOMAIN, STATES, COMMANDS = "0", "/joint_states", "/effort_controller/commands"
-DIVISORS = (1, 2, 4, 5, 10, 20)
 KINDS = {
     "silence": Kind("no joint states from then on", NOTHING),
     "nan": Kind("share of joint states with a position that is none"),
@@ -27,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--states", default=STATES, metavar="TOPIC", help=f"of the joint states, {STATES}")
     add("--commands", default=COMMANDS, metavar="TOPIC", help=f"of the torques, {COMMANDS}")
     words = "joint states come every N ms, default 1"
-    add("--every", type=int, choices=DIVISORS, default=1, metavar="N", help=words)
+    add("--every", type=int, choices=(1, 2, 4, 5, 10, 20), default=1, metavar="N", help=words)
     words = "the drives brake when no command is new for so long; 0 never, as without a watch"
     add("--watch", type=float, default=0.1, metavar="S", help=words)
     add("--no-description", action="store_true", help="nobody publishes /robot_description")

@@ -24,13 +24,13 @@ from adapter.control.resting import CarriedWeight
 from adapter.control.settings import ExcitationSettings
 from adapter.errors import SettingsError
 from adapter.model.robots import documented
-from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
+from adapter.realtime.following import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.session import run_lockstep
 from adapter.realtime.snapshot import SnapshotWriter
 from adapter.signals.front_end import FrontEnd
 from drivers.faults.driver import with_faults
 from drivers.interface import JointSample
-from sim.obstacles import Obstacles
+from sim.joint_effects import Obstacles
 from sim.scenarios import Scenario, build
 from tests.helpers.benchmark import options, write
 from tests.helpers.live_learners import nothing_known

@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapter.effects.export import robot_mjcf, robot_urdf
-from adapter.effects.robots import documented
+from adapter.effects.robots import documented, robot_mjcf, robot_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.runs.fleet.engine import here
 from adapter.runs.fleet.fleet import Settings, found_logs, learn_fleet

@@ -3,7 +3,7 @@
     python tests/benchmarks/lambda_trials.py trees --first 0 --trials 200 --seeds 3
     python tests/benchmarks/lambda_trials.py arms --json FILE
 
-Trees are drawn as CAD draws them (`tests.helpers.cad_trees`). Arms are the URDFs of
+Trees are drawn as CAD draws them (`tests.helpers.random_trees`). Arms are the URDFs of
 `example-robot-data` (extra `robots`): ERD_ROBOTS names their folder where the package lies
 somewhere else.
 """
@@ -35,7 +35,7 @@ from adapter.physics.identifiability import random_motion
 from adapter.physics.kernels import Frames, base_at_rest, frames_of, link_motions
 from adapter.signals.front_end import FrontEnd
 from tests.helpers.benchmark import Row, options, write
-from tests.helpers.cad_trees import cad_tree
+from tests.helpers.random_trees import cad_tree
 
 ARMS = {
     "ur3": "ur_description/urdf/ur3_robot.urdf",

@@ -25,13 +25,13 @@ from adapter.learning.tree_data import TreeData
 from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_zxz
 from sim.falls.data_set import data_set
-from sim.falls.tree_truth import TreeLimits, TreeTruth
+from sim.falls.fall import TreeLimits, TreeTruth, atlas
 from tests.helpers.benchmark import Row, options, write
 
 
 def motions(robot: str, folder: Path, count: int) -> tuple[Any, list[TreeData]]:
     """The truth, and `count` exact motions of it with no velocity measured."""
-    data = data_set(floating_panda() if robot == "panda" else robot, count, folder=folder)
+    data = data_set(floating_panda() if robot == "panda" else atlas(), count, folder=folder)
     source = Falls(data, data)
     return source.truth, [without_velocity(source.exact(k)) for k in range(count)]
 

@@ -214,7 +214,7 @@ def theta_trial(
 
 def can_arm(world: Scenario, seed: int) -> Driver:
     """The arm behind Damiao motors: 16, 12 and 12 bits, replies of the joints one by one."""
-    from tests.helpers.can_lockstep import on_line
+    from tests.helpers.lockstep_drivers import on_line
 
     return on_line(world)[0]
 

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from soak import family
 
-from adapter.realtime.loop_board import BLOCK_BYTES, LoopBoard, LoopTiming
 from adapter.realtime.shared import SHM_FOLDER, SharedBlock
+from adapter.realtime.timing import BLOCK_BYTES, LoopBoard, LoopTiming
 from tests.helpers.benchmark import options, write
 from tests.helpers.browser import Tab, tab
 

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from soak import simulated
 
-from adapter.realtime.clock import Clock
-from adapter.realtime.real_time import RealTime, split_cores
+from adapter.realtime.real_time import Clock, RealTime, split_cores
 
 SHARES = (50, 99, 99.9, 100)
 FRESH_NS = 1_000_000

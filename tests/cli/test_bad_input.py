@@ -9,7 +9,7 @@ import pytest
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import build_parser, main
 from adapter.cli.run import run_plan
-from adapter.effects.export import to_urdf
+from adapter.effects.robots import to_urdf
 from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel

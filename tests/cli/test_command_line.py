@@ -12,7 +12,7 @@ from adapter.cli import main
 from adapter.model.model_file import load_model
 from drivers.files.mcap import read_log, read_messages
 from tests.helpers.robot_models import PANDA
-from tests.helpers.ros_readers import assert_read_by_everybody, same
+from tests.helpers.ros_messages import assert_read_by_everybody, same
 
 pytestmark = pytest.mark.alone
 

@@ -11,9 +11,9 @@ from adapter.cli.main import build_parser, main
 from adapter.cli.run import controller_of, run_plan
 from adapter.control.designed import DesignedMotion
 from adapter.control.limits import MotionLimits
-from adapter.effects.splits import LOADS, SPEEDS
+from adapter.effects.phrases import LOADS, SPEEDS
 from adapter.model.robots import documented
-from tests.helpers.ros_readers import by_mcap_ros2
+from tests.helpers.ros_messages import by_mcap_ros2
 
 pytest.importorskip("coal")
 LIMITS = MotionLimits.of(documented("panda"))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
-from adapter.control.sample_clock import SampleClock
+from adapter.control.reading_gate import SampleClock
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented

@@ -19,13 +19,13 @@ from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.push_bound import PushBound, left_at_most, push_bound
 from adapter.control.settings import ExcitationSettings, SafetySettings
-from adapter.effects.export import to_urdf
+from adapter.effects.robots import to_urdf
 from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
-from tests.helpers.played import played
+from tests.helpers.live_tools import played
 from tests.helpers.robot_models import pin_model
 
 PANDA = documented("panda")
@@ -211,11 +211,6 @@ def test_forces_at_the_hand_that_a_motion_is_ended_by() -> None:
     force = np.concatenate(stops)
     assert 0.85 < bound.most / force.max() < 1.1
     assert abs(np.mean(force < bound.middle) - 0.5) < 0.03
-
-
-def test_the_plan_says_both_bounds() -> None:
-    motion = RandomMotion(LIMITS, READY, ExcitationSettings(seed=3))
-    bound = push_bound(PANDA, motion, LIMITS, SafetySettings())
     first, last = bound.lines()
     assert f"{bound.middle:.0f} N for half" in first
     assert f"{bound.most:.0f} N for the worst" in first

@@ -9,13 +9,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from adapter.control.cell import Box, Cell, Cylinder, Hand, Plane
 from adapter.control.designed import DesignedMotion, Designer
 from adapter.control.excitation import RandomMotion
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.information import Information
 from adapter.control.limits import MotionLimits
-from adapter.control.settings import ExcitationSettings, gentle
+from adapter.control.settings import Box, Cell, Cylinder, ExcitationSettings, Hand, Plane, gentle
 from adapter.control.shapes import bodies_of
 from adapter.errors import ModelWarning, SettingsError
 from adapter.model.robots import documented

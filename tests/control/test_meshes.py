@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.control import meshes
-from adapter.control.cell import Box, Cell, Mesh
+from adapter.control import shapes
 from adapter.control.free_path import ArmInCell
 from adapter.control.limits import MotionLimits
-from adapter.control.meshes import file_of, read_mesh
-from adapter.control.shapes import bodies_of
+from adapter.control.settings import Box, Cell, Mesh
+from adapter.control.shapes import bodies_of, file_of, read_mesh
 from adapter.errors import ModelWarning, SettingsError
 from adapter.model.robots import documented
 from adapter.model.urdf import read_urdf
@@ -192,7 +191,7 @@ def test_a_file_that_lies_is_refused_in_a_sentence(tmp_path: Path, name, content
 
 
 def test_what_is_too_large_is_refused_before_it_takes_memory(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 11)
+    monkeypatch.setattr(shapes, "MOST_TRIANGLES", 11)
     for name, content in (("a.stl", stl(SIZE)), ("b.stl", text_stl(SIZE)), ("c.obj", obj(SIZE))):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match="at most 11 are read, simplify it"):

@@ -26,7 +26,7 @@ from drivers.damiao.settings import BusSettings
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario, build
-from tests.helpers.can_lockstep import Lockstep
+from tests.helpers.lockstep_drivers import Lockstep
 
 PANDA = documented("panda")
 LIMITS = [Scales(12.5, 25.0, 100.0)] * 2

@@ -10,7 +10,7 @@ from drivers.files.messages import MotionEncoder
 from drivers.files.ros_types import TWIST_STAMPED
 from drivers.interface import DriverError
 from tests.helpers.mcap_tools import JOINTS, LINKS, foreign, payloads, record, samples
-from tests.helpers.ros_readers import assert_read_by_everybody
+from tests.helpers.ros_messages import assert_read_by_everybody
 
 
 def stacked(items, name):

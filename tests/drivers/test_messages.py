@@ -15,7 +15,7 @@ from drivers.files.messages import Message, TransformsEncoder, decode, encode, h
 from drivers.files.ros import CdrError
 from drivers.files.ros_types import DIAGNOSTICS, ESTIMATE, STRING, TF, schemas
 from tests.helpers.mcap_tools import START_NS, samples
-from tests.helpers.ros_readers import assert_read_by_everybody, same
+from tests.helpers.ros_messages import assert_read_by_everybody, same
 
 PUBLIC = [name for name in schemas() if not name.startswith("panda_adapter_msgs")]
 NAMES = EstimateNames(("shoulder", "elbow", "wrist"), ("upper", "lower"), ("coulomb_friction",))

@@ -6,27 +6,28 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import interp1d
 from scipy.signal import butter, lsim, lti, sosfiltfilt
 
 from adapter.effects.active import active_effects, check_effects
-from adapter.effects.backlash import play
 from adapter.effects.base import Effect, JointTorque, Motion, polar
+from adapter.effects.bodies import parameters_of, theta_of
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import WAYS_RAD, JointSignals, smooth_sign
 from adapter.effects.catalogue import CATALOGUE, LEARNED
-from adapter.effects.payload import parameters_of, theta_of
-from adapter.effects.splits import experiments
+from adapter.effects.encoders import play
+from adapter.effects.phrases import experiments
 from adapter.effects.torque import ModelTorque, sensed_torque
 from adapter.errors import ModelError
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
+from sim.effects import Effect as Oracles
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model as truth_model
 from tests.helpers.arm_data import rnea
+from tests.helpers.gap_effects import joint_torque, rigid
 from tests.helpers.robot_models import relative
 
 N, J = 7, 3  # joints; the one that most effects sit on, from 0
@@ -34,7 +35,6 @@ PERIOD_S = 1e-3
 MODEL = documented("panda")
 ARM = RigidArm.of(MODEL)
 ORACLE = truth_model(panda())
-GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def motion(seconds: float = 4.0) -> Motion:
@@ -67,28 +67,6 @@ def on_joint(torque: np.ndarray, joint: int = J) -> np.ndarray:
     out = RIGID.copy()
     out[:, joint] += torque
     return out
-
-
-def pin_inertia(theta: np.ndarray) -> pin.Inertia:
-    return pin.Inertia.FromDynamicParameters(np.asarray(theta)[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]])
-
-
-def changed_body(joint: int, body: pin.Inertia) -> pin.Model:
-    model = truth_model(panda())
-    model.appendBodyToJoint(joint + 1, body, pin.SE3.Identity())
-    return model
-
-
-def jacobians(q: np.ndarray) -> np.ndarray:
-    """(m, 6, n) of the last joint's frame, axes of the base, linear rows first."""
-    data = ORACLE.createData()
-    frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    found = []
-    for row in q:
-        pin.computeJointJacobians(ORACLE, data, row)
-        pin.updateFramePlacements(ORACLE, data)
-        found.append(pin.getJointJacobian(ORACLE, data, N, frame).copy())
-    return np.array(found)
 
 
 def test_the_rigid_arm_is_pinocchios() -> None:
@@ -275,45 +253,23 @@ def test_a_play_narrower_than_any_that_is_looked_for_is_rare() -> None:
 
 LOAD = {"m": 1.3, "cx": 0.02, "cy": -0.03, "cz": 0.09}
 SIX = [4e-3, 1e-4, -2e-4, 5e-3, 3e-4, 6e-3]
-TENSOR = np.array([[4e-3, 1e-4, -2e-4], [1e-4, 5e-3, 3e-4], [-2e-4, 3e-4, 6e-3]])
+DTHETA = [0.4, 0.02, -0.01, 0.03, 0.01, 1e-3, 2e-3, 0.012, -1e-3, 0.008]
+WRENCH = {"fx": 10.0, "fy": -6.0, "fz": 15.0, "mx": 0.4, "my": 0.7, "mz": -0.2}
 
 
-@pytest.mark.parametrize("inertia", [None, SIX])
-def test_payload_is_a_body_on_the_last_link(inertia: list[float] | None) -> None:
-    more = {} if inertia is None else {"inertia": inertia}
-    tensor = np.zeros((3, 3)) if inertia is None else TENSOR
-    body = pin.Inertia(LOAD["m"], np.array([LOAD["cx"], LOAD["cy"], LOAD["cz"]]), tensor)
-    theirs = rnea(changed_body(N - 1, body), Q, DQ, DDQ)
-    assert relative(sensed(entry("payload", (), **LOAD, **more)), theirs) < 1e-9
-
-
-def test_link_inertia_is_added_to_the_link() -> None:
-    dtheta = np.array([0.4, 0.02, -0.01, 0.03, 0.01, 1e-3, 2e-3, 0.012, -1e-3, 0.008])
-    theirs = rnea(changed_body(J, pin_inertia(dtheta)), Q, DQ, DDQ)
-    assert relative(sensed(entry("link_inertia", dtheta=dtheta.tolist())), theirs) < 1e-9
-
-
-def test_base_tilt_turns_the_base_under_gravity() -> None:
-    tilt = np.array([0.03, -0.02, 0.0])
-    model = truth_model(panda())
-    model.gravity.linear = pin.exp3(tilt).T @ GRAVITY
-    theirs = rnea(model, Q, DQ, DDQ)
-    assert relative(sensed(entry("base_tilt", (), rx=0.03, ry=-0.02)), theirs) < 1e-9
-
-
-def test_external_wrench_pushes_the_arm() -> None:
-    keys = ("fx", "fy", "fz", "mx", "my", "mz")
-    wrench = np.array([10.0, -6.0, 15.0, 0.4, 0.7, -0.2])
-    pushed = entry("external_wrench", (), **dict(zip(keys, wrench.tolist(), strict=True)))
-    theirs = RIGID - np.einsum("mij,i->mj", jacobians(Q), wrench)
-    assert relative(sensed(pushed), theirs) < 1e-9
-    force = [pin.Force.Zero() for _ in range(ORACLE.njoints)]
-    data = ORACLE.createData()
-    pin.forwardKinematics(ORACLE, data, Q[100])
-    turn = data.oMi[N].rotation.T
-    force[N] = pin.Force(turn @ wrench[:3], turn @ wrench[3:])
-    one = pin.rnea(ORACLE, data, Q[100], DQ[100], DDQ[100], force)
-    assert relative(sensed(pushed)[100], one) < 1e-9
+@pytest.mark.parametrize(
+    ("name", "joints", "parameters"),
+    [
+        ("payload", (), LOAD),
+        ("payload", (), {**LOAD, "inertia": SIX}),
+        ("link_inertia", (J + 1,), {"dtheta": DTHETA}),
+        ("base_tilt", (), {"rx": 0.03, "ry": -0.02}),
+        ("external_wrench", (), WRENCH),
+    ],
+)
+def test_bodies_gravity_and_a_wrench_are_pinocchios(name, joints, parameters) -> None:
+    theirs = joint_torque(panda(), [Oracles(name, joints, parameters)], T, Q, DQ, DDQ)
+    assert relative(sensed(entry(name, joints, **parameters)), theirs) < 1e-9
 
 
 MOVING = {
@@ -341,11 +297,8 @@ def test_effects_act_in_their_interval_alone(name: str) -> None:
 
 def test_stages_work_on_each_other() -> None:
     """A gain reads friction too; friction by load knows the payload; the payload feels the tilt."""
-    model = truth_model(panda())
-    body = pin.Inertia(LOAD["m"], np.array([LOAD["cx"], LOAD["cy"], LOAD["cz"]]), np.zeros((3, 3)))
-    model.appendBodyToJoint(N, body, pin.SE3.Identity())
-    model.gravity.linear = pin.exp3(np.array([0.02, 0.01, 0.0])).T @ GRAVITY
-    theirs = rnea(model, Q, DQ, DDQ)
+    bodies = Oracles("payload", (), LOAD), Oracles("base_tilt", (), {"rx": 0.02, "ry": 0.01})
+    theirs = rigid(panda(), bodies, T, Q, DQ, DDQ)
     theirs[:, J] += 0.05 * np.abs(theirs[:, J]) * SIGN + 0.5 * SIGN
     theirs[:, J] *= 1.08
     ours = sensed(

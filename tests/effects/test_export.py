@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from adapter.effects.active import with_bodies
-from adapter.effects.export import robot_mjcf, robot_urdf, to_urdf
+from adapter.effects.robots import robot_mjcf, robot_urdf, to_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel

@@ -24,7 +24,8 @@ from adapter.runs.batch import learn_batch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import make_front_end, make_learner
-from adapter.signals.records import StateLayout
+from adapter.signals.records import StateLayout, stamps_of
+from sim.effects import Effect
 from tests.helpers.arm_data import (
     ArmData,
     Motion,
@@ -37,13 +38,12 @@ from tests.helpers.arm_data import (
     states_of,
     teach,
 )
+from tests.helpers.gap_effects import sense
 
 N = 7
 AT = StateLayout(N)
-PERIOD_S = 1e-3
 MOTION = Motion(10.0, seed=4)
 LOAD = {"m": 1.0, "cx": 0.0, "cy": 0.01, "cz": 0.08, "inertia": [2e-3, 0, 0, 2e-3, 0, 2e-3]}
-TWO_FRICTIONS = (0.3, 0.03), (0.2, 0.04)  # N m s/rad: value and standard deviation
 FRICTION = ("viscous_friction", "coulomb_friction")
 
 
@@ -53,57 +53,6 @@ def entry(name: str, joints: object = (), **parameters: object) -> dict[str, obj
 
 def with_effects(*entries: dict[str, object], model: SelfModel | None = None) -> SelfModel:
     return replace(model or panda_model(), effects=entries)
-
-
-def rate(x: np.ndarray) -> np.ndarray:
-    return np.gradient(x, PERIOD_S, axis=0, edge_order=2)
-
-
-def late(x: np.ndarray, d: float) -> np.ndarray:
-    t = PERIOD_S * np.arange(len(x))
-    return np.interp(t - d, t, x)
-
-
-def played(q: np.ndarray, b: float) -> np.ndarray:
-    """Motor angle (m,) that moves a link along q through a play of full width b."""
-    motor = np.empty_like(q)
-    last = q[0]
-    for k, link in enumerate(q):
-        step = link - q[k - 1] if k else 0.0
-        target = link + 0.5 * b * np.sign(step)
-        last = target if step else last
-        motor[k] = last
-    return motor
-
-
-def changed(data: ArmData, name: str) -> ArmData:
-    """The recording as an arm with the effect gives it, by the table's equations."""
-    q, dq, tau = data.q.copy(), data.dq.copy(), data.tau.copy()
-    true_q, true_dq, _, true_tau = data.true
-    if name == "encoder_offset":
-        q[:, 3] += 0.02
-    elif name == "encoder_ripple":
-        q[:, 3] += 0.01 * np.sin(true_q[:, 3] + 0.4)
-        dq[:, 3] += 0.01 * np.cos(true_q[:, 3] + 0.4) * true_dq[:, 3]
-    elif name == "joint_elasticity":
-        q[:, 1] += true_tau[:, 1] / 4000.0
-        dq[:, 1] += rate(true_tau[:, 1]) / 4000.0
-    elif name == "backlash":
-        q[:, 3] += played(true_q[:, 3], 0.01) - true_q[:, 3]
-    elif name == "torque_gain":
-        tau[:, 1] += 0.08 * true_tau[:, 1]
-    elif name == "signal_delay":
-        tau = np.array([late(x, 0.004) for x in tau.T]).T
-    elif name == "joint_spring":
-        tau[:, 3] += 1.5 * (true_q[:, 3] + 1.0)
-    elif name == "torque_ripple":
-        tau[:, 1] += 0.4 * np.sin(3 * true_q[:, 1] + 0.2)
-    elif name == "load_dependent_friction":
-        tau[:, 1] += 0.06 * np.abs(true_tau[:, 1]) * np.tanh(true_dq[:, 1] / 0.01)
-    elif name == "stribeck_friction":
-        curve = 0.3 + 0.4 * np.exp(-((true_dq[:, 3] / 0.1) ** 2))
-        tau[:, 3] += curve * np.tanh(true_dq[:, 3] / 0.01)
-    return replace(data, q=q, dq=dq, tau=tau)
 
 
 TAKEN_OFF = {
@@ -119,12 +68,21 @@ TAKEN_OFF = {
     "stribeck_friction": entry("stribeck_friction", [4], Fc=0.3, Fs=0.7, vs=0.1),
 }
 # what the low-pass makes of what jumps, or of the twist's rates, is not undone to the last bit
-SHARE_LEFT = dict.fromkeys(TAKEN_OFF, 0.05) | {
-    "joint_elasticity": 0.2,
-    "backlash": 0.25,
-    "load_dependent_friction": 0.25,
-    "stribeck_friction": 0.35,
-}
+SHARE_LEFT = {"joint_elasticity": 0.2, "backlash": 0.1, "stribeck_friction": 0.15}  # else 0.05
+
+
+def changed(data: ArmData, *names: str) -> ArmData:
+    """The recording as an arm with effects of `TAKEN_OFF` gives it, by the tests' own equations.
+
+    The speed at which a motor crosses the play is left out: it is far beyond the filter's band.
+    """
+    told = [TAKEN_OFF[name] for name in names]
+    effects = [Effect(x["effect"], tuple(x["joints"]), x["parameters"]) for x in told]  # type: ignore[arg-type]
+    read = sense(arm(), effects, 1e-9 * data.stamp_ns, *data.true[:3])
+    q, dq, _, tau = data.true
+    more = (x - true for x, true in zip(read, (q, dq, tau), strict=True))
+    q, dq, tau = (x + y for x, y in zip((data.q, data.dq, data.tau), more, strict=True))
+    return replace(data, q=q, dq=data.dq if "backlash" in names else dq, tau=tau)
 
 
 def known_effects(*entries: dict[str, object]) -> KnownEffects:
@@ -145,11 +103,12 @@ def test_what_is_known_is_taken_off(name: str) -> None:
     """In torque that the arm does not explain: with the effect, without, with it taken off."""
     clean = record(arm(), MOTION, noisy=False).part(8.0)
     without, seen = states_of(clean), states_of(changed(clean, name))
+    without = without[np.isin(stamps_of(without), stamps_of(seen))]  # a jump is not learned from
     freed = known_effects(TAKEN_OFF[name]).take_off(seen)
     size = rms(torque_left(seen) - torque_left(without)).max()
     left = rms(torque_left(freed) - torque_left(without)).max()
     assert size > 0.02
-    assert left < SHARE_LEFT[name] * size
+    assert left < SHARE_LEFT.get(name, 0.05) * size
 
 
 def test_tables_and_single_states_are_the_same() -> None:
@@ -204,9 +163,7 @@ def held_out(learner: OnlineLearner, *effects: dict[str, object]) -> np.ndarray:
 
 def test_theta_is_the_arms_where_the_model_knows_of_sensors_and_gears() -> None:
     names = ("encoder_offset", "torque_gain", "joint_elasticity", "joint_spring")
-    data = record(arm(), MOTION)
-    for name in names:
-        data = changed(data, name)
+    data = changed(record(arm(), MOTION), *names)
     told = held_out(learn(data, with_effects(*(TAKEN_OFF[name] for name in names))))
     untold = held_out(learn(data, panda_model()))
     best = held_out(plain())
@@ -263,7 +220,8 @@ def test_a_surer_model_is_left_less_easily() -> None:
 
 def test_two_entries_of_one_effect_add_up_and_so_do_their_doubts() -> None:
     """As a search leaves them that found what an earlier one had left."""
-    twice = [entry("viscous_friction", (3,), Fv=x) | {"std": {"Fv": s}} for x, s in TWO_FRICTIONS]
+    told = (0.3, 0.03), (0.2, 0.04)  # N m s/rad: value and standard deviation
+    twice = [entry("viscous_friction", (3,), Fv=x) | {"std": {"Fv": s}} for x, s in told]
     model = with_effects(*twice)
     values, std = believed(lasting_effects(model.effects, N), FRICTION, N)
     assert values[0, 2] == pytest.approx(0.5) and std[0, 2] == pytest.approx(0.05)
@@ -353,7 +311,7 @@ def test_what_cannot_be_taken_off_is_said() -> None:
 def test_batches_take_off_what_is_known() -> None:
     """The model is the arm's, spring and offset included: in batches as sample by sample."""
     model = with_effects(TAKEN_OFF["joint_spring"], TAKEN_OFF["encoder_offset"])
-    data = changed(changed(record(arm(), MOTION), "joint_spring"), "encoder_offset")
+    data = changed(record(arm(), MOTION), "joint_spring", "encoder_offset")
     learner = make_learner(model, PipelineSettings())
     learn_batch(learner, [states_of(data, model)], 10, lambda done: None)
     assert held_out(learner).max() < 0.05

@@ -12,15 +12,27 @@ import pytest
 import torch
 
 from adapter.errors import ModelError
-from adapter.experiments.baselines.compare import compare, select, validation_part
-from adapter.experiments.baselines.elm import ElmCommittee
+from adapter.experiments.baselines.by_physics import (
+    DeepLagrangian,
+    MassNetwork,
+    RegressorLeastSquares,
+    lagrange_torque,
+)
+from adapter.experiments.baselines.compare import (
+    Choice,
+    compare,
+    contenders,
+    select,
+    validation_part,
+)
 from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
-from adapter.experiments.baselines.gaussian_process import GaussianProcess, negative_log_likelihood
-from adapter.experiments.baselines.lagrangian import DeepLagrangian, MassNetwork, lagrange_torque
 from adapter.experiments.baselines.learner import Baseline, Scale
-from adapter.experiments.baselines.least_squares import RegressorLeastSquares
-from adapter.experiments.baselines.network import FeedForward
-from adapter.experiments.baselines.presets import Choice, learners
+from adapter.experiments.baselines.paper import (
+    ElmCommittee,
+    FeedForward,
+    GaussianProcess,
+    negative_log_likelihood,
+)
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
@@ -248,7 +260,7 @@ def test_a_gpu_s_way_through_torch_gives_the_same(
     answers = []
     for place in (None, torch.device("cuda" if torch.cuda.is_available() else "cpu")):
         monkeypatch.setattr(
-            "adapter.experiments.baselines.dense.accelerator", lambda place=place: place
+            "adapter.experiments.baselines.learner.accelerator", lambda place=place: place
         )
         learner.fit(x, y)
         answers.append(learner.predict(x))
@@ -269,7 +281,7 @@ def test_the_experiments_learners_have_the_papers_sizes() -> None:
     index = sub_chain(TREE, ARM, CARRIER)
     schema = Columns(3), sub_parents(TREE, index), robot(0)[0][index]
     for full, members in ((True, 50), (False, 20)):
-        found = {choice.key: choice.make() for choice in learners(*schema, full=full)}
+        found = {choice.key: choice.make() for choice in contenders(*schema, full=full)}
         assert list(found) == ["FFNN", "ELM", "GPR", "DeLaN", "WLS"]
         elm, gpr, net = found["ELM"], found["GPR"], found["FFNN"]
         assert net.units == 1000

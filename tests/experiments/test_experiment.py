@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
-from adapter.experiments.baselines.compare import Errors, compare
-from adapter.experiments.baselines.elm import ElmCommittee
-from adapter.experiments.baselines.presets import Choice
-from adapter.experiments.panda import run_panda
+from adapter.experiments.baselines.compare import Choice, Errors, compare
+from adapter.experiments.baselines.paper import ElmCommittee
+from adapter.experiments.command import run_panda
+from adapter.experiments.falls import SETS, split
 from adapter.experiments.results import LearnerScores
-from adapter.experiments.split import SETS, split
 from tests.helpers.pages import every_command
 
 CHANNELS = {"w", "v", "a", "dw"}

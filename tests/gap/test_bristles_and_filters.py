@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from adapter.effects.base import Effect as Fitted
-from adapter.effects.bristle_friction import BristleFriction
-from adapter.effects.stribeck_friction import StribeckFriction
+from adapter.effects.bristle_friction import BristleFriction, StribeckFriction
 from adapter.gap.result import Finding
 from adapter.gap.workflow import find_gap
 from sim.effects import Effect

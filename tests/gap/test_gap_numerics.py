@@ -17,8 +17,8 @@ from scipy.stats import multivariate_normal
 from adapter.effects import CATALOGUE
 from adapter.effects.active import WHOLE, Active
 from adapter.effects.base import LINK, Motion
+from adapter.effects.bodies import theta_of
 from adapter.effects.by_joint import AT_REST
-from adapter.effects.payload import theta_of
 from adapter.effects.torque import sensed_torque
 from adapter.gap.candidates import (
     Candidate,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
-from adapter.effects.splits import experiments
+from adapter.effects.phrases import experiments
 from adapter.gap.result import Curves, Finding, GapResult, Leftover, RolloutCurves, Shortfall
 
 NOISE_NM = 0.02

@@ -17,8 +17,8 @@ from drivers.interface import Driver, JointSample
 from drivers.ros2.arm import Ros2Arm
 from sim.scenarios import build
 from tests.helpers.board_tools import free_port
-from tests.helpers.can_lockstep import Lockstep, on_line
 from tests.helpers.contract_suite import Start
+from tests.helpers.lockstep_drivers import Lockstep, on_line
 
 SERVE = "-m", "adapter", "sim"
 PANDA_JOINTS = tuple(f"panda_joint{j}" for j in range(1, 8))

@@ -124,6 +124,17 @@ def left_behind(names: list[str]) -> list[str]:
     return [name for name in names if (Path("/dev/shm") / name.lstrip("/")).exists()]
 
 
+def played(motion, stop_s, dt_s):
+    """q, dq, ddq (m, n) every dt_s, the stop asked for at stop_s."""
+    rows = [[motion.q, motion.dq, motion.ddq]]
+    while not motion.at_rest:
+        if motion.time_s >= stop_s:
+            motion.begin_stop()
+        motion.advance(dt_s)
+        rows.append([motion.q, motion.dq, motion.ddq])
+    return np.moveaxis(np.array(rows), 1, 0)
+
+
 def wait_for(condition, timeout_s: float = 30.0) -> bool:
     """Whether it came true in time."""
     end = time.monotonic() + timeout_s

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from adapter.gap.servo import UNITS, ServoGap
 from adapter.gap.servo_model import ServoModel
 from drivers.files.mcap import Commands, Log, McapWriter
-from sim.compiled import compiled
-from sim.dynamics import Frames, end_effector, mass_matrix, torques
+from sim.dynamics import Frames, compiled, end_effector, mass_matrix, torques
 from sim.hidden.motion import draw_motion
 from sim.truth import Array, Truth, documented
 

@@ -1,14 +1,62 @@
-"""Trees of random shape for the simulator of falls."""
+"""Random trees: for the simulator of falls, and as CAD draws them.
+
+Those have right angles and half turns between frames, and axes that meet.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sim.falls.tree_truth import BASE, TreeLimits, TreeTruth
+from adapter.learning.theta import neutral_body
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import exp_rotation, rot_x, rot_y, rot_z, zxz_from_matrix
+from adapter.model.tree import Tree
+from sim.falls.fall import BASE, TreeLimits, TreeTruth
 from sim.truth import Array, theta_of, turn
 
+MOST_JOINTS = 30
+ANY_ANGLE = 0.25  # share of frames that stand at any angle; the others at right angles
+NO_OFFSET, ALONG_AN_AXIS = 0.2, 0.5  # shares of origins
+
+
+def cad_tree(seed: int, joints: int | None = None) -> SelfModel:
+    """A tree of 2 to 30 joints on a fixed base.
+
+    Args:
+        seed: of everything.
+        joints: how many; any number where None.
+    """
+    rng = np.random.default_rng([seed, 17])
+    n = int(rng.integers(2, MOST_JOINTS + 1)) if joints is None else joints
+    reach = int(rng.integers(1, 5))  # 1: a chain
+    parent = [-1, *(int(rng.integers(max(0, j - reach), j)) for j in range(1, n))]
+    lam = np.array([np.r_[zxz_from_matrix(_rotation(rng)), _offset(rng)] for _ in range(n)])
+    theta = np.tile(neutral_body(), (n, 1))
+    return SelfModel(f"cad{seed}", Tree(tuple(parent)), lam, theta)
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    if rng.random() < ANY_ANGLE:
+        return exp_rotation(rng.uniform(0.0, np.pi) * _direction(rng))
+    quarter = 0.5 * np.pi * rng.integers(0, 4, 3)
+    return rot_z(quarter[0]) @ rot_y(quarter[1]) @ rot_x(quarter[2])
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    x = rng.normal(size=3)
+    return np.asarray(x / np.linalg.norm(x))
+
+
+def _offset(rng: np.random.Generator) -> np.ndarray:
+    kind, length = rng.random(), rng.uniform(0.02, 0.5)
+    if kind < NO_OFFSET:
+        return np.zeros(3)
+    if kind < NO_OFFSET + ALONG_AN_AXIS:
+        return length * float(rng.choice([-1.0, 1.0])) * np.eye(3)[rng.integers(3)]
+    return length * _direction(rng)
+
+
 GRAVITY = (0.0, 0.0, -9.81)  # m/s², world axes
-FEWEST, MOST = 5, 60  # links of a random tree
 NEAR = 16  # a random tree's link hangs on one of so many before it: chains as well as branches
 REACH_M = 0.12  # rms distance between two joints of a random tree, per axis
 DENSITY = 1000.0  # kg/m³, of the boxes that random links are made of (water; robots are close)
@@ -20,14 +68,9 @@ def random_tree(links: int, seed: int) -> TreeTruth:
     """A tree of random shape: boxes of water's density, joined anywhere, turning about any axis.
 
     Args:
-        links: moving ones, 5 to 60.
+        links: moving ones.
         seed: same seed, same tree.
-
-    Raises:
-        ValueError: fewer or more links than that.
     """
-    if not FEWEST <= links <= MOST:
-        raise ValueError(f"a random tree has {FEWEST} to {MOST} moving links, got {links}")
     rng = np.random.default_rng([seed, links])
     parent = tuple(int(rng.integers(max(BASE, k - NEAR), k)) for k in range(links))
     half = rng.uniform(*RANGE_RAD, links)

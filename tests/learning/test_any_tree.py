@@ -9,7 +9,7 @@ from adapter.learning.frame_fit import Frame, best_frame, channel_costs, profile
 from adapter.model.spatial import exp_rotation, rot_x
 from tests.benchmarks.lambda_trials import learn, states_of
 from tests.helpers.arm_data import learner_for
-from tests.helpers.cad_trees import cad_tree
+from tests.helpers.random_trees import cad_tree
 
 
 @pytest.mark.parametrize("number", [2, 7, 107])

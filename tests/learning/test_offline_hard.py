@@ -22,7 +22,7 @@ from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.inertia import min_eigenvalue, theta_from_body
 from adapter.model.tree import Tree
 from adapter.physics.networks import FrameMotion, link_motion
-from sim.falls.tree_truth import TreeTruth
+from sim.falls.fall import TreeTruth
 from tests.helpers.random_trees import random_tree
 from tests.helpers.torque_errors import torque_errors
 

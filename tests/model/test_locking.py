@@ -10,7 +10,7 @@ import pinocchio as pin
 import pybullet_data
 import pytest
 
-from adapter.effects.export import robot_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.locking import locked, restricted
 from adapter.model.model_file import dumps, loads

@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from adapter.effects.export import robot_mjcf
-from adapter.effects.robots import read_robot
+from adapter.effects.robots import read_robot, robot_mjcf
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.model_file import load_model, save_model

@@ -10,7 +10,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from adapter.effects.export import robot_urdf, to_urdf
+from adapter.effects.robots import robot_urdf, to_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
 from adapter.model.model_file import dumps, loads

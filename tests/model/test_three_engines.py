@@ -16,7 +16,7 @@ import pinocchio as pin
 import pybullet
 import pytest
 
-from adapter.effects.export import robot_mjcf, robot_urdf
+from adapter.effects.robots import robot_mjcf, robot_urdf
 from adapter.model.inertia import body_from_theta
 from adapter.model.self_model import SelfModel, Tool
 from adapter.model.spatial import rot_z, z_to_axis

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.effects.export import robot_urdf, to_urdf
+from adapter.effects.robots import robot_urdf, to_urdf
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented, names

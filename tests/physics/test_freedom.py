@@ -10,7 +10,7 @@ from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import frame_observability, random_motion
 from adapter.physics.kernels import Frames, base_at_rest, link_motions
-from tests.helpers.cad_trees import cad_tree
+from tests.helpers.random_trees import cad_tree
 
 DOWN = np.array([0.0, 0.0, -9.81])
 # Shoulder and elbow of an upright arm, with the offsets that a UR has.

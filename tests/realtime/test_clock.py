@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adapter.realtime import real_time
-from adapter.realtime.clock import Clock, sleep_until
+from adapter.realtime.real_time import Clock, sleep_until
 from adapter.realtime.timing import Histogram, Timing
 
 PERIOD = 1_000_000

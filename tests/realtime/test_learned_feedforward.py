@@ -9,7 +9,7 @@ from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.model.robots import documented
-from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
+from adapter.realtime.following import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.session import run_lockstep
 from adapter.realtime.snapshot import SnapshotError, SnapshotWriter
 from adapter.signals.front_end import FrontEnd

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.realtime.clock import sleep_until
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
+from adapter.realtime.real_time import sleep_until
 from adapter.realtime.session import Session, run_lockstep
 from adapter.realtime.showing import DisplayJob
 from adapter.realtime.worker import WorkerError

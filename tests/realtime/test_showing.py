@@ -15,11 +15,10 @@ import pytest
 from adapter.realtime import SnapshotReader, SnapshotWriter
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
-from adapter.realtime.loop_board import LINES_BYTES, LoopBoard
 from adapter.realtime.ring import Ring
 from adapter.realtime.showing import DisplayJob, Looker
 from adapter.realtime.snapshot import NEWS_BYTES
-from adapter.realtime.timing import COUNTED, Timing
+from adapter.realtime.timing import COUNTED, LINES_BYTES, LoopBoard, Timing
 from tests.helpers import live_tools as tools
 
 pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]

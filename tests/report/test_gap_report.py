@@ -22,8 +22,9 @@ from adapter.gap.words import (
     rivals,
     sentence,
 )
-from adapter.report.gap_page import render_gap_page, write_gap_page
-from adapter.report.gap_signatures import shown_joints
+from adapter.report.gap_page import render_gap_page
+from adapter.report.gap_panels import shown_joints
+from adapter.report.html import write_whole
 from adapter.runs.run_folder import RunFolderError
 from tests.helpers import gap_results as made_up
 from tests.helpers.browser import (
@@ -318,9 +319,9 @@ def test_names_are_escaped() -> None:
 
 
 def test_it_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = write_gap_page(result_of("nothing"), tmp_path / "new" / "gap.html")
+    path = write_whole(tmp_path / "new" / "gap.html", "<html></html>")
     assert path.read_text("utf-8").endswith("</html>")
     assert [p.name for p in path.parent.iterdir()] == ["gap.html"]
     (tmp_path / "file").write_text("")
     with pytest.raises(RunFolderError, match="cannot be written"):
-        write_gap_page(result_of("nothing"), tmp_path / "file" / "gap.html")
+        write_whole(tmp_path / "file" / "gap.html", "")

@@ -21,11 +21,10 @@ from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
 from adapter.realtime.session import run_lockstep
 from adapter.report import render, write_report
-from adapter.report.headline import headline
+from adapter.report.learned_panels import bodies_over_time, rotation_path
 from adapter.report.next_steps import _again, next_steps
-from adapter.report.schema_panels import rotation_path
 from adapter.report.style import thin
-from adapter.report.torque_panels import bodies_over_time
+from adapter.report.trust import headline
 from adapter.report.worth import SLOW, Worth, slow_share, torque_fall
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adapter.realtime.session import run_lockstep
-from adapter.report.headline import headline
+from adapter.report.trust import headline
 from adapter.report.worth import Worth
 from adapter.runs import live
 from adapter.runs.config import PipelineSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.effects.export import to_urdf
+from adapter.effects.robots import to_urdf
 from adapter.learning.learner import OnlineLearner
 from adapter.model.model_file import dumps, loads
 from adapter.model.spatial import matrix_from_zxz, rot_z, zxz_from_matrix

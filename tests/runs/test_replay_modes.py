@@ -19,7 +19,7 @@ from adapter.runs.pipeline import Pipeline
 from adapter.runs.replay import MOST_PER_UPDATE, Replay, ReplayOptions, one_after_other, replay
 from adapter.runs.score import theta_score
 from adapter.signals.matching import matching
-from drivers.files.mcap import Log, read_log, write_log
+from drivers.files.mcap import read_log, write_log
 from drivers.interface import DriverError
 from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
@@ -164,15 +164,12 @@ def test_progress_is_told() -> None:
         assert told == sorted(told) and told[-1] < 2500
 
 
-def renamed(log: Log, names: tuple[str, ...], **more) -> Log:
-    return replace(log, joint_names=names, **more)
-
-
 def test_names_in_another_order_are_put_in_order() -> None:
     log = data().log()
     order = [3, 0, 6, 1, 5, 2, 4]
     names = tuple(log.joint_names[k] for k in order)
-    mixed = renamed(log, names, q=log.q[:, order], dq=log.dq[:, order], tau=log.tau[:, order])
+    parts = {key: getattr(log, key)[:, order] for key in ("q", "dq", "tau")}
+    mixed = replace(log, joint_names=names, **parts)
     found = matching(mixed, panda_model())
     assert found.joint_names == panda_model().tree.joint_names
     assert np.array_equal(found.q, log.q) and np.array_equal(found.tau, log.tau)
@@ -182,7 +179,7 @@ def test_names_in_another_order_are_put_in_order() -> None:
 def test_another_prefix_means_the_same_joints_with_a_warning() -> None:
     log = data().log()
     names = tuple(f"fer_joint{k + 1}" for k in range(N))[::-1]
-    found = matching(renamed(log, names, q=log.q[:, ::-1]), panda_model())
+    found = matching(replace(log, joint_names=names, q=log.q[:, ::-1]), panda_model())
     assert np.array_equal(found.q, log.q)
     assert len(found.warnings) == 1 and "matched by their numbers" in found.warnings[0]
     assert "fer_joint1 = panda_joint1" in found.warnings[0]
@@ -198,7 +195,7 @@ def test_another_prefix_means_the_same_joints_with_a_warning() -> None:
 )
 def test_names_that_say_nothing_are_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(DriverError) as refused:
-        matching(renamed(data().log(), names), panda_model())
+        matching(replace(data().log(), joint_names=names), panda_model())
     assert "arm_data.mcap: has no joint" in str(refused.value)
     assert names[0] in str(refused.value) and "panda_joint7" in str(refused.value)
 
@@ -207,13 +204,13 @@ def test_a_missing_joint_is_named() -> None:
     log = data().log()
     names = (*log.joint_names[:4], "gripper", *log.joint_names[5:])
     with pytest.raises(DriverError, match=r"has no joint panda_joint5; it has .*gripper.*; panda"):
-        matching(renamed(log, names), panda_model())
+        matching(replace(log, joint_names=names), panda_model())
 
 
 def test_extra_joints_are_ignored_with_a_warning() -> None:
     log = data().log()
     wide = {k: np.c_[np.ones(len(log)), getattr(log, k)] for k in ("q", "dq", "tau")}
-    found = matching(renamed(log, ("finger", *log.joint_names), **wide), panda_model())
+    found = matching(replace(log, joint_names=("finger", *log.joint_names), **wide), panda_model())
     assert np.array_equal(found.q, log.q)
     assert len(found.warnings) == 1 and "ignored: finger" in found.warnings[0]
 

@@ -22,9 +22,9 @@ import pytest
 
 from sim.damiao import codec as wire
 from sim.damiao.bus import open_bus
+from sim.damiao.faults import add_arguments, check
 from sim.damiao.host import ServedBus
 from sim.damiao.motor import SETS
-from sim.damiao.options import add_arguments, check
 from sim.damiao.server import BoardOptions, Boards, run
 from sim.effects import Effect
 from sim.noise import levels_of

@@ -64,30 +64,17 @@ def test_a_limp_arm_falls_as_the_equations_of_motion_say(scenario, most) -> None
     assert np.abs(dq - speeds[-1]).max() < 1e-3
 
 
-def test_the_law_holds_and_swings_as_spring_and_damper_do() -> None:
-    """A step of 0.1 rad in the wanted angles, speed wanted, feed-forward on top."""
-    wanted = READY + 0.1
-    gains = np.array([400.0] * 4 + [40.0] * 3), np.array([5.0] * 4 + [0.5] * 3)
+def moved_by(commands, ticks):
+    """Angles, speeds (m, n) and torques once all commands are in force, what the equations of
+    motion say of angles and speeds, and the law of torque."""
     with rig() as bench:
         bench.enable()
-        commands = [
-            mit(PANDA[j], q=wanted[j], dq=0.2, kp=gains[0][j], kd=gains[1][j]) for j in range(7)
-        ]
-        for motor, data in zip(IDS, commands, strict=True):
-            bench.send(motor, data)
-        bench.pass_ms(1.0)
-        assert not bench.boards.world.held
-        world, times, found, torques = bench.boards.world, [], [], []
-        start_ns = None
-        for _ in range(300):
-            bench.pass_ms(1.0)
-            bench.boards.service()
+        world, rows = bench.boards.world, []
+        for _ in range(ticks):
+            bench.tick(commands)
             end_ns, q, dq = world.state()
-            if not times:
-                start_ns, q0, dq0 = end_ns, q.copy(), dq.copy()
-            times.append((end_ns - start_ns) * 1e-9)
-            found.append(q)
-            torques.append([world.at(end_ns, j)[2] for j in range(7)])
+            if not world.held:
+                rows.append((end_ns * 1e-9, q, dq, [world.at(end_ns, j)[2] for j in range(7)]))
         sent = [m.command for m in bench.boards.motors]
         truth = bench.scenario.truth
     q_des, dq_des, kp, kd, ff = (np.array(column) for column in zip(*sent, strict=True))
@@ -95,36 +82,24 @@ def test_the_law_holds_and_swings_as_spring_and_damper_do() -> None:
     def law(t, q, dq):
         return kp * (q_des - q) + kd * (dq_des - dq) + ff
 
-    expected, speeds = integrate(truth, law, np.array(times), q0, dq0)
-    assert np.abs(np.array(found) - expected).max() < 2e-4
-    assert np.abs(expected - q0).max() > 0.1
-    for tau, q, dq in zip(torques, expected, speeds, strict=True):
-        assert np.abs(tau - law(0.0, q, dq)).max() < 0.15  # of up to 40 N m
+    # From the third tick on: before it not all commands were in force.
+    times, *found = (np.array(column[3:]) for column in zip(*rows, strict=True))
+    return found, integrate(truth, law, times - times[0], found[0][0], found[1][0]), law
+
+
+def test_the_law_holds_and_swings_as_spring_and_damper_do() -> None:
+    """A step of 0.1 rad in the wanted angles, with a speed wanted."""
+    gains = zip([400.0] * 4 + [40.0] * 3, [5.0] * 4 + [0.5] * 3, READY + 0.1, PANDA, strict=True)
+    commands = [mit(scale, q=q, dq=0.2, kp=kp, kd=kd) for kp, kd, q, scale in gains]
+    (found, _, torques), (expected, speeds), law = moved_by(commands, 300)
+    assert np.abs(found - expected).max() < 2e-4
+    assert np.abs(expected - found[0]).max() > 0.1
+    assert np.abs(torques - law(0.0, expected, speeds)).max() < 0.15  # of up to 40 N m
 
 
 def test_full_damping_sinks_and_does_not_ring_on_the_lightest_joint() -> None:
     """kd = 5 N m s/rad on 0.005 kg m²: a law that lagged by a tick would blow up."""
-    with rig() as bench:
-        bench.enable()
-        commands = [mit(PANDA[j], kd=5.0) for j in range(7)]
-        times, found, speeds = [], [], []
-        for _ in range(100):
-            bench.tick(commands)
-            end_ns, q, dq = bench.boards.world.state()
-            if not bench.boards.world.held:
-                times.append(end_ns * 1e-9)
-                found.append(q)
-                speeds.append(dq)
-        sent = [m.command for m in bench.boards.motors]
-        truth = bench.scenario.truth
-    _, dq_des, _, kd, ff = (np.array(column) for column in zip(*sent, strict=True))
-
-    def law(t, q, dq):
-        return kd * (dq_des - dq) + ff
-
-    # From the third tick on: before it not all commands were in force.
-    times, found, speeds = np.array(times[3:]), np.array(found[3:]), np.array(speeds[3:])
-    expected, fast = integrate(truth, law, times - times[0], found[0], speeds[0])
+    (found, speeds, _), (expected, fast), _ = moved_by([mit(x, kd=5.0) for x in PANDA], 100)
     assert np.abs(found - expected).max() < 2e-4
     assert np.abs(speeds - fast).max() < 5e-3
     assert np.abs(speeds).max() > 1.0
@@ -303,21 +278,18 @@ def test_replies_queue_behind_commands_up_to_the_end_of_the_cycle() -> None:
     assert np.diff(after_us) == pytest.approx([51] * 6, abs=3)
 
 
-def test_lines_are_alike_bit_by_bit_when_run_twice() -> None:
-    def run():
-        with rig("friction", faults=["drop=0.1", "late=0.1", "corrupt=0.1"], seed=5) as bench:
+def test_lines_are_alike_bit_by_bit_when_run_twice_with_one_seed() -> None:
+    def run(seed):
+        faults = ["drop=0.1", "late=0.1", "corrupt=0.1", "repeat=0.1"]
+        with rig("friction", faults=faults, seed=seed) as bench:
             bench.enable()
-            out = []
-            for _ in range(100):
-                out += [
-                    (m.arbitration_id, bytes(m.data), m.timestamp)
-                    for m in bench.tick(bench.hold(READY))
-                ]
-        return out
+            rows = [bench.tick(bench.hold(READY)) for _ in range(100)]
+        return [(m.arbitration_id, bytes(m.data), m.timestamp) for row in rows for m in row]
 
-    first = run()
+    first = run(5)
     assert len(first) > 500
-    assert first == run()
+    assert first == run(5)
+    assert [x[0] for x in first] != [x[0] for x in run(6)]
 
 
 def test_a_register_read_costs_no_motion_and_the_stand_none_either() -> None:

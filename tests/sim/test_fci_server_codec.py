@@ -16,7 +16,6 @@ from sim.fci.codec import (
     Request,
     RequestReader,
     StateFrame,
-    connect_reply,
     limit_reply,
     read_command,
     reply,
@@ -153,9 +152,9 @@ def test_random_bytes_are_refused_or_read(data, version):
 def test_replies_have_their_published_bytes():
     connect = Request("Connect", 0, 9, struct.pack("<HH", 5, 4000))
     assert connect.connect_terms() == (5, 4000)
-    said = connect_reply(connect, "ok", 5, 5)
+    said = reply(connect, "ok", 5, struct.pack("<H", 5))
     assert said == bytes.fromhex("00000000 09000000 0f000000 00 0500")
-    assert connect_reply(connect, "incompatible", 5, 7)[12:] == bytes((1, 7, 0))
+    assert reply(connect, "incompatible", 5)[12:] == bytes((1,))
     move = Request("Move", 1, 2, struct.pack("<II", 2, 1) + bytes(48))
     assert move.move_modes() == (2, 1)
     assert reply(move, "motion started", 5) == bytes.fromhex("01000000 02000000 0d000000 01")

@@ -1,4 +1,6 @@
-"""What the simulated arm's sensors add, and what its scenarios are."""
+"""What the simulated arm's sensors add, what its scenarios are, and what pushes back in its way."""
+
+from __future__ import annotations
 
 import json
 from itertools import pairwise
@@ -8,13 +10,15 @@ import pytest
 from scipy.signal import butter, sosfreqz
 
 from adapter.model.robots import documented as known
-from adapter.model.robots.known import facts_of as facts_about
+from adapter.model.robots import facts_of as facts_about
 from drivers.interface import JointSample
+from sim.dynamics import end_effector
 from sim.effects import effect_from
+from sim.joint_effects import Obstacles
 from sim.noise import BAND_HZ, RATE_HZ, SensorNoise, band_response, levels_of
 from sim.options import ROBOTS, SCENARIOS
 from sim.scenarios import build
-from sim.truth import facts_of, panda, turn
+from sim.truth import FLANGE, facts_of, panda, turn
 
 T_S = 1e-3
 
@@ -97,23 +101,26 @@ def test_lost_repeated_and_badly_stamped_samples():
     assert np.std(off) == pytest.approx(1e5, rel=0.1)
 
 
-def test_scenarios_refuse_what_they_do_not_know():
-    with pytest.raises(ValueError, match=r"no scenario 'nomnal'; have: .*; did you mean nominal"):
-        build("nomnal")
-    with pytest.raises(ValueError, match=r"no option 'mas'; have: .*; did you mean mass"):
-        build("payload_at_20s", mas=1.0)
-    with pytest.raises(ValueError, match="no robot 3; have: panda, fr3"):
-        build("nominal", robot=3)
-    with pytest.raises(ValueError, match="have: real, none"):
-        build("nominal", noise="loud")
-    with pytest.raises(ValueError, match="no noise level 'hum'; have: dq_above"):
-        build("nominal", levels={"hum": 1.0})
-    with pytest.raises(ValueError, match="mass is -1"):
-        build("payload_at_20s", mass=-1)
-    with pytest.raises(ValueError, match="mass is 'heavy'; have: numbers"):
-        build("payload_at_20s", mass="heavy")
-    with pytest.raises(ValueError, match="links is 'no'; have: True, False"):
-        build("nominal", links="no")
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("nomnal", {}, r"no scenario 'nomnal'; have: .*; did you mean nominal"),
+        ("payload_at_20s", {"mas": 1.0}, r"no option 'mas'; have: .*; did you mean mass"),
+        ("nominal", {"robot": 3}, "no robot 3; have: panda, fr3"),
+        ("nominal", {"noise": "loud"}, "have: real, none"),
+        ("nominal", {"levels": {"hum": 1.0}}, "no noise level 'hum'; have: dq_above"),
+        ("payload_at_20s", {"mass": -1}, "mass is -1"),
+        ("payload_at_20s", {"mass": "heavy"}, "mass is 'heavy'; have: numbers"),
+        ("nominal", {"links": "no"}, "links is 'no'; have: True, False"),
+        ("nominal", {"trouble": 3}, "have: a table of held"),
+        ("nominal", {"trouble": {"x": 1}}, "held, wall"),
+        ("nominal", {"trouble": {"held": [0]}}, "NUMBER"),
+        ("nominal", {"trouble": {"wall": "far"}}, "from 0 up"),
+    ],
+)
+def test_scenarios_refuse_what_they_do_not_know(name, options, said):
+    with pytest.raises(ValueError, match=said):
+        build(name, **options)
 
 
 def test_bent_link_stays_inside_its_bounds_and_depends_on_the_seed():
@@ -177,3 +184,58 @@ def test_nominal_arm_is_the_documented_one():
     assert arm.theta[:, 0].sum() == pytest.approx(16.0622, abs=1e-4)
     assert arm.lam[1] == pytest.approx([0, -np.pi / 2, 0, 0, 0, 0])
     assert arm.lam[3] == pytest.approx([0, np.pi / 2, 0, 0.0825, 0, 0])
+
+
+def driven(trouble: dict, push: float, ticks: int = 400):
+    """A plant whose joint 1 is pushed with so many N m beyond what carries the arm."""
+    plant = build("nominal", noise="none", trouble=trouble).plant()
+    plant.read()
+    hold = plant.link_state()[2].copy()
+    for _ in range(ticks):
+        plant.command(hold + np.array([push, *np.zeros(6)]))
+        plant.read()
+    return plant
+
+
+def test_a_held_joint_gives_way_by_as_much_as_it_is_pushed() -> None:
+    plant = driven({"held": [1, 2, 3, 4, 5, 6, 7]}, 20.0)
+    q, dq, _ = plant.link_state()
+    assert q[0] - plant.truth.ready[0] == pytest.approx(20.0 / 5000.0, rel=0.05)
+    assert np.abs(dq).max() < 1e-3
+    assert plant.pushed()[0] == pytest.approx(-20.0, rel=0.02)
+    plant.close()
+
+
+def test_a_wall_stands_across_the_hand_s_way_and_only_pushes_back() -> None:
+    arm = build("nominal", trouble={"wall": 0.02}).truth
+    wall = Obstacles(arm.effects, arm.n)
+    q, dq = arm.ready, np.array([0.5, 0.2, 0.0, 0.1, 0.0, 0.0, 0.0])
+    _, J = end_effector(arm.frames, q, FLANGE)
+    speed = np.linalg.norm(J[:3] @ dq)
+    for ahead, depth in ((0.0, 0.0), (0.019, 0.0), (0.021, 0.001), (0.025, 0.005)):
+        wall.act(0.0, q + dq * ahead / speed, dq, arm.frames)
+        expected = 20000.0 * depth + 200.0 * speed * (depth > 0.0)
+        assert wall.force == pytest.approx(expected, rel=0.1, abs=1e-9)
+        assert wall.torque @ dq == pytest.approx(-wall.force * speed, rel=0.05)
+    wall.act(0.0, q, dq, arm.frames)
+    assert wall.force == 0.0 and not wall.torque.any()
+
+
+def test_a_floor_carries_the_hand_and_lets_it_slide_only_when_pushed_hard() -> None:
+    arm = build("nominal").truth
+    pose, J = end_effector(arm.frames, arm.ready, FLANGE)
+    floor = Obstacles(build("nominal", trouble={"floor": pose[2, 3] + 1e-3}).truth.effects, arm.n)
+    way = np.linalg.pinv(J)  # of joint motions that move the hand
+
+    def pushed(x: float, z: float) -> np.ndarray:
+        """Force on the hand when it stands so far off the start."""
+        q = arm.ready + way @ [x, 0.0, z, 0.0, 0.0, 0.0]
+        floor.act(0.0, q, np.zeros(7), arm.frames)
+        return np.linalg.pinv(end_effector(arm.frames, q, FLANGE)[1].T) @ floor.torque
+
+    assert pushed(0.0, 0.0)[:3] == pytest.approx([0.0, 0.0, 20.0], abs=0.1)
+    assert pushed(2e-4, 0.0)[:3] == pytest.approx([-4.0, 0.0, 20.0], abs=0.1)
+    assert pushed(2e-2, 0.0)[0] == pytest.approx(-0.5 * pushed(2e-2, 0.0)[2], rel=0.01)
+    assert pushed(2e-2 - 1e-4, 0.0)[0] == pytest.approx(2.0 - 0.5 * pushed(2e-2, 0.0)[2], abs=0.3)
+    assert not pushed(0.0, 2e-3).any()
+    assert floor.force == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -15,11 +16,12 @@ from sim.noise import levels_of
 from sim.plant import Plant
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model, rms
+from tests.helpers.gap_effects import joint_torque, rnea, torque_sensor
 from tests.sim.test_plant import T_S, reference
 
 SECONDS = 1.0
 OWN = 20  # samples between two looks at the plant's own acceleration
-SLOW = 0.03  # rad/s, below it tanh(dq / 0.01) bends within the samples of a difference
+SLOW = 0.05  # rad/s, below it tanh(dq / 0.01) bends within the samples of a difference
 SETTLED = 60  # samples, before that the torque has a corner
 NEAR = 5  # samples around a change in time
 STIFFNESS = np.array([100, 100, 100, 100, 40, 40, 20])  # N m/rad, against friction
@@ -51,11 +53,8 @@ class Record:
         self.t = np.arange(len(rows)) * T_S
         self.ddq = np.gradient(self.dq, T_S, axis=0)
 
-    def rigid(self, model=None):
-        model = model or pin_model(panda())
-        data = model.createData()
-        rows = zip(self.q, self.dq, self.ddq, strict=True)
-        return np.array([pin.rnea(model, data, *row) for row in rows])
+    def rigid(self):
+        return rnea(panda(), self.q, self.dq, self.ddq)
 
     def steady(self, effect):
         """Rows to compare: settled, away from reversals of stiff joints and from changes."""
@@ -74,88 +73,52 @@ def arm_with(*effects):
     return panda().with_changes(effects=effects)
 
 
-def sign(dq):
-    return np.tanh(dq / 0.01)
-
-
-PASSING = ("viscous_friction", "coulomb_friction", "motor_inertia", "torque_ripple")  # switched
-
-# Name, joint, parameters, torque of the effect from the record and its rigid torque.
-TORQUES = [
-    ("viscous_friction", 2, {"Fv": 0.8}, lambda r, x, j: 0.8 * r.dq[:, j]),
-    ("coulomb_friction", 4, {"Fc": 1.5}, lambda r, x, j: 1.5 * sign(r.dq[:, j])),
-    ("coulomb_friction", 7, {"Fc": 0.5}, lambda r, x, j: 0.5 * sign(r.dq[:, j])),
-    (
-        "asymmetric_friction",
-        3,
-        {"Fc_pos": 1.2, "Fc_neg": 0.4},
-        lambda r, x, j: np.where(r.dq[:, j] > 0, 1.2, 0.4) * sign(r.dq[:, j]),
-    ),
-    (
-        "stribeck_friction",
-        5,
-        {"Fc": 0.3, "Fs": 0.8, "vs": 0.2},
-        lambda r, x, j: (0.3 + 0.5 * np.exp(-((r.dq[:, j] / 0.2) ** 2))) * sign(r.dq[:, j]),
-    ),
-    (
-        "load_dependent_friction",
-        2,
-        {"Fl": 0.06},
-        lambda r, x, j: 0.06 * np.abs(x[:, j]) * sign(r.dq[:, j]),
-    ),
-    ("friction_drift", 1, {"dFc": 0.8}, lambda r, x, j: 0.8 * r.t * sign(r.dq[:, j])),
-    ("motor_inertia", 6, {"B": 0.2}, lambda r, x, j: 0.2 * r.ddq[:, j]),
-    (
-        "torque_ripple",
-        4,
-        {"a": 0.5, "n": 12.0, "phase": 0.7},
-        lambda r, x, j: 0.5 * np.sin(12 * r.q[:, j] + 0.7),
-    ),
-    ("joint_spring", 3, {"k": 1.5, "q0": -0.4}, lambda r, x, j: 1.5 * (r.q[:, j] + 0.4)),
-    ("x_quadratic_drag", 1, {"c": 1.0}, lambda r, x, j: r.dq[:, j] * np.abs(r.dq[:, j])),
-    ("x_cubic_spring", 2, {"c": 1.5, "q0": 0.2}, lambda r, x, j: 1.5 * (r.q[:, j] - 0.2) ** 3),
-    (
-        "x_position_friction",
-        4,
-        {"A": 0.8, "phase": 2.5},
-        lambda r, x, j: 0.8 * (1 + np.sin(r.q[:, j] + 2.5)) * sign(r.dq[:, j]),
-    ),
-    ("x_sine_disturbance", 5, {"a": 0.4, "f": 3.0}, lambda r, x, j: 0.4 * np.sin(6 * np.pi * r.t)),
-    (
-        "x_velocity_ripple",
-        3,
-        {"a": 0.5, "n": 8.0, "phase": 0.2},
-        lambda r, x, j: 0.5 * np.sin(8 * r.q[:, j] + 0.2) * r.dq[:, j],
-    ),
+# Sizes that show in the motion of `Record`; equations are those of `tests.helpers.gap_effects`.
+ON_JOINTS = [
+    Effect("viscous_friction", (2,), {"Fv": 0.8}),
+    Effect("coulomb_friction", (4,), {"Fc": 1.5}),
+    Effect("asymmetric_friction", (3,), {"Fc_pos": 1.2, "Fc_neg": 0.4}),
+    Effect("stribeck_friction", (5,), {"Fc": 0.3, "Fs": 0.8, "vs": 0.2}),
+    Effect("load_dependent_friction", (2,), {"Fl": 0.06}),
+    Effect("friction_drift", (1,), {"dFc": 0.8}),
+    Effect("motor_inertia", (6,), {"B": 0.2}),
+    Effect("torque_ripple", (4,), {"a": 0.5, "n": 12.0, "phase": 0.7}),
+    Effect("joint_spring", (3,), {"k": 1.5, "q0": -0.4}),
+    Effect("x_quadratic_drag", (1,), {"c": 1.0}),
+    Effect("x_cubic_spring", (2,), {"c": 1.5, "q0": 0.2}),
+    Effect("x_position_friction", (4,), {"A": 0.8, "phase": 2.5}),
+    Effect("x_sine_disturbance", (5,), {"a": 0.4, "f": 3.0, "phase": 0.0}),
+    Effect("x_velocity_ripple", (3,), {"a": 0.5, "n": 8.0, "phase": 0.2}),
+    Effect("x_cross_viscous", (2, 4), {"c": 0.8}),
 ]
+DTHETA = [0.4, 0.02, -0.03, 0.05, 0.01, 0.002, -0.001, 0.012, 0.001, 0.009]
+BALL = {"m": 1.5, "cx": 0.02, "cy": -0.03, "cz": 0.15}
+INERTIA = [2e-3, 3e-4, -1e-4, 3e-3, 2e-4, 4e-3]
+BODIES = [
+    Effect("payload", (), {**BALL, "inertia": INERTIA}),
+    Effect("payload", (7,), BALL),
+    Effect("link_inertia", (4,), {"dtheta": DTHETA}),
+    Effect("base_tilt", (), {"rx": 0.03, "ry": -0.05}),
+]
+WRENCH = Effect("external_wrench", (), {"fx": 12.0, "fy": -8.0, "fz": 5.0, "mx": 0.5, "mz": -0.3})
+PASSING = ("viscous_friction", "coulomb_friction", "motor_inertia", "torque_ripple")  # switched
+FOR_A_TIME = [*(e for e in ON_JOINTS if e.name in PASSING), *BODIES, WRENCH]
 
 
-ALWAYS = [(None, *row) for row in TORQUES]
-FOR_A_TIME = [((0.4, 0.8), *row) for row in TORQUES if row[0] in PASSING]
-
-
-@pytest.mark.parametrize(("span", "name", "joint", "numbers", "torque"), ALWAYS + FOR_A_TIME)
-def test_torque_of_an_effect_is_that_of_the_table(span, name, joint, numbers, torque):
-    effect = Effect(name, (joint,), numbers, span)
+@pytest.mark.parametrize(
+    "effect",
+    [*ON_JOINTS, *BODIES, *(replace(e, interval_s=(0.4, 0.8)) for e in FOR_A_TIME)],
+)
+def test_torque_of_an_effect_is_that_of_the_table(effect):
     record = Record(arm_with(effect))
     rigid = record.rigid()
-    on = (record.t >= span[0]) & (record.t < span[1]) if span else np.ones(len(record.t), bool)
-    wanted = np.zeros_like(rigid)
-    wanted[:, joint - 1] = on * torque(record, rigid, joint - 1)
+    wanted = joint_torque(panda(), [effect], record.t, record.q, record.dq, record.ddq)
     rows = record.steady(effect)
-    assert rms(wanted[rows]).max() > 0.05
-    assert rms((record.read_tau - rigid - wanted)[rows]).max() < 3e-3
+    assert rms((wanted - rigid)[rows]).max() > 0.05
+    assert rms((record.read_tau - wanted)[rows]).max() < 3e-3
     rows &= np.arange(len(rows)) % OWN == 0
     assert rms((record.own_ddq - record.ddq)[rows]).max() < 0.1
     assert np.array_equal(record.read_q, record.q) and np.array_equal(record.read_dq, record.dq)
-
-
-def test_cross_viscous_torque_acts_on_the_second_joint():
-    effect = Effect("x_cross_viscous", (2, 4), {"c": 0.8})
-    record = Record(arm_with(effect))
-    left = record.read_tau - record.rigid()
-    left[:, 3] -= 0.8 * record.dq[:, 1]
-    assert rms(left[SETTLED:-2]).max() < 3e-3
 
 
 @pytest.mark.parametrize("s0", [2e-3, 0.01])
@@ -172,79 +135,12 @@ def test_bristles_follow_the_dahl_model(s0):
     assert rms(left[SETTLED:-2]) < 5e-3 * 0.01 / s0
 
 
-def payload_model(m, com, inertia):
-    model = pin_model(panda())
-    model.appendBodyToJoint(7, pin.Inertia(m, np.array(com), inertia), pin.SE3.Identity())
-    return model
-
-
-def heavier_model():
-    theta = panda().theta.copy()
-    theta[3] += DTHETA
-    return pin_model(panda().with_changes(theta=theta))
-
-
-def tilted_model(rx, ry):
-    model = pin_model(panda())
-    model.gravity.linear = pin.exp3(np.array([rx, ry, 0.0])).T @ panda().gravity
-    return model
-
-
-DTHETA = [0.4, 0.02, -0.03, 0.05, 0.01, 0.002, -0.001, 0.012, 0.001, 0.009]
-BALL = {"m": 1.5, "cx": 0.02, "cy": -0.03, "cz": 0.15}
-INERTIA = [2e-3, 3e-4, -1e-4, 3e-3, 2e-4, 4e-3]
-TENSOR = np.array([[2e-3, 3e-4, -1e-4], [3e-4, 3e-3, 2e-4], [-1e-4, 2e-4, 4e-3]])
-BODIES = [
-    (
-        Effect("payload", (), {**BALL, "inertia": INERTIA}),
-        lambda: payload_model(1.5, [0.02, -0.03, 0.15], TENSOR),
-    ),
-    (Effect("payload", (7,), BALL), lambda: payload_model(1.5, [0.02, -0.03, 0.15], 0 * TENSOR)),
-    (Effect("link_inertia", (4,), {"dtheta": DTHETA}), heavier_model),
-    (Effect("base_tilt", (), {"rx": 0.03, "ry": -0.05}), lambda: tilted_model(0.03, -0.05)),
-]
-
-
-@pytest.mark.parametrize("span", [None, (0.4, 0.8)])
-@pytest.mark.parametrize(("effect", "model"), BODIES)
-def test_changed_bodies_and_gravity_act_in_their_interval(effect, model, span):
-    effect = Effect(effect.name, effect.joints, effect.parameters, span)
-    record = Record(arm_with(effect))
-    on = np.asarray(effect.acts(record.t))[:, None]
-    wanted = np.where(on, record.rigid(model()), record.rigid())
-    rows = record.steady(effect)
-    assert rms((wanted - record.rigid())[rows]).max() > 0.1
-    assert rms((record.read_tau - wanted)[rows]).max() < 3e-3
-
-
-def test_external_wrench_acts_at_the_last_origin_in_base_axes():
-    numbers = {"fx": 12.0, "fy": -8.0, "fz": 5.0, "mx": 0.5, "mz": -0.3}
-    effect = Effect("external_wrench", (), numbers, (0.3, 0.9))
-    record = Record(arm_with(effect))
-    model = pin_model(panda())
-    data = model.createData()
-    wanted = record.rigid()
-    for k in np.flatnonzero(effect.acts(record.t)):
-        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        J = pin.computeJointJacobians(model, data, record.q[k])
-        J = pin.getJointJacobian(model, data, 7, frame)
-        wanted[k] -= J.T @ np.array([12.0, -8.0, 5.0, 0.5, 0.0, -0.3])
-    rows = record.steady(effect)
-    assert rms((record.read_tau - record.rigid())[rows]).max() > 1.0
-    assert rms((record.read_tau - wanted)[rows]).max() < 3e-3
-
-
 def read_as(record):
     return {"q": record.read_q, "dq": record.read_dq, "tau": record.read_tau}
 
 
 def slopes(x):
     return np.diff(x, axis=0, prepend=x[:1]) / T_S
-
-
-def late(x, d):
-    t = np.arange(len(x)) * T_S
-    return np.array([np.interp(t - d, t, column) for column in x.T]).T
 
 
 def one(values, joint):
@@ -254,7 +150,7 @@ def one(values, joint):
     return out
 
 
-SENSORS = [
+ENCODERS = [
     (
         Effect("joint_elasticity", (2,), {"k": 4000.0}),
         lambda r: {
@@ -270,25 +166,19 @@ SENSORS = [
             "dq": r.dq + one(0.008 * np.cos(r.q[:, 3] + 0.4) * r.dq[:, 3], 4),
         },
     ),
-    (Effect("torque_gain", (2,), {"g": 0.05}), lambda r: {"tau": r.u + one(0.05 * r.u[:, 1], 2)}),
-    (Effect("torque_offset", (6,), {"o": 0.4}), lambda r: {"tau": r.u + one(0.4 + 0 * r.t, 6)}),
-    (Effect("signal_delay", (), {"d": 0.0023}), lambda r: {"tau": late(r.u, 0.0023)}),
-    (
-        Effect("signal_delay", (4,), {"d": 0.004}),
-        lambda r: {"tau": r.u + one((late(r.u, 0.004) - r.u)[:, 3], 4)},
-    ),
-    (
-        Effect("x_torque_crosstalk", (2, 3), {"share": 0.04}),
-        lambda r: {"tau": r.u + one(0.04 * r.u[:, 1], 3)},
-    ),
-    (
-        Effect("x_torque_deadband", (4,), {"w": 0.5}),
-        lambda r: {"tau": r.u - one(np.clip(r.u[:, 3], -0.5, 0.5), 4)},
-    ),
-    (
-        Effect("x_torque_saturation", (2,), {"s": 60.0}),
-        lambda r: {"tau": r.u + one(60 * np.tanh(r.u[:, 1] / 60) - r.u[:, 1], 2)},
-    ),
+]
+TORQUE_SENSORS = [
+    Effect("torque_gain", (2,), {"g": 0.05}),
+    Effect("torque_offset", (6,), {"o": 0.4}),
+    Effect("signal_delay", (), {"d": 0.0023}),
+    Effect("signal_delay", (4,), {"d": 0.004}),
+    Effect("x_torque_crosstalk", (2, 3), {"share": 0.04}),
+    Effect("x_torque_deadband", (4,), {"w": 0.5}),
+    Effect("x_torque_saturation", (2,), {"s": 60.0}),
+]
+SENSORS = [
+    *ENCODERS,
+    *((e, lambda r, e=e: {"tau": torque_sensor([e], r.t, r.u)}) for e in TORQUE_SENSORS),
 ]
 
 
@@ -357,7 +247,7 @@ def test_effects_act_together():
     record = Record(arm_with(*effects))
     wanted = record.rigid()
     late = record.t >= 0.5
-    wanted[:, 3] += late * 0.8 * sign(record.dq[:, 3]) + record.q[:, 3]
+    wanted[:, 3] += late * 0.8 * np.tanh(record.dq[:, 3] / 0.01) + record.q[:, 3]
     wanted[:, 3] *= 0.96
     assert rms((record.read_tau - wanted)[record.steady(effects[0])]).max() < 3e-3
 
@@ -416,10 +306,9 @@ def test_effects_on_joints_that_are_not_there_are_refused():
 
 
 def test_every_effect_of_the_catalogue_is_tested_here():
-    tested = {row[0] for row in TORQUES} | {row[0].name for row in BODIES + SENSORS}
-    tested |= {"x_cross_viscous", "external_wrench", "backlash"}
-    tested |= {"bristle_friction", "torque_filter"}
-    tested |= {"x_held_joint", "x_wall", "x_floor"}  # in `test_obstacles`
+    tested = {e.name for e in (*ON_JOINTS, *BODIES, WRENCH, *TORQUE_SENSORS)}
+    tested |= {e.name for e, _ in ENCODERS} | {"backlash", "bristle_friction", "torque_filter"}
+    tested |= {"x_held_joint", "x_wall", "x_floor"}  # in `test_scenarios`
     assert tested == set(SPECS)
 
 

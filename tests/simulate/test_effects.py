@@ -13,7 +13,7 @@ import pinocchio as pin
 import pybullet
 import pytest
 
-from adapter.effects.export import additions, robot_mjcf, to_urdf
+from adapter.effects.robots import additions, robot_mjcf, to_urdf
 from adapter.errors import MeansError, ModelError, SettingsError
 from adapter.model.mjcf_text import MJCF_PLACES, joint_attributes
 from adapter.model.self_model import SelfModel
@@ -21,6 +21,7 @@ from adapter.simulate import FORMATS, SIMULATORS, Effects, MujocoArm, Rollouts
 from sim.effects import Effect
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model
+from tests.helpers.gap_effects import joint_torque
 from tests.simulate.test_rollouts import CASES, PANDA, SENSED, model_with
 
 READY = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])
@@ -54,8 +55,8 @@ def placed(simulator: str, model: SelfModel, dq: np.ndarray = STILL) -> Any:
 
 
 def test_the_torque_is_that_of_the_effects_own_equations() -> None:
-    """Where nothing is stiff, against Pinocchio's rigid torque and the equations by hand."""
-    model = model_with(
+    """Where nothing is stiff; the torque's offset is a sensor's."""
+    effects = (
         Effect("viscous_friction", (1,), {"Fv": 0.6}),
         Effect("coulomb_friction", (2,), {"Fc": 0.5}),
         Effect("stribeck_friction", (4,), {"Fc": 0.4, "Fs": 1.0, "vs": 0.3}),
@@ -63,11 +64,11 @@ def test_the_torque_is_that_of_the_effects_own_equations() -> None:
         Effect("torque_offset", (6,), {"o": 2.0}),
         Effect("friction_drift", (7,), {"dFc": 0.02}),
     )
-    added = Effects(model, 1e-6, "bodies")(READY, DQ, STILL, torque_of(READY, DQ), 5.0)
-    stribeck = 0.4 + 0.6 * np.exp(-((DQ[3] / 0.3) ** 2))
-    by_hand = [0.6 * DQ[0], -0.5, 0.0, stribeck]
-    by_hand += [0.4 * np.sin(6.0 * READY[4] + 0.2), 0.0, -0.02 * 5.0]  # the offset is a sensor's
-    np.testing.assert_allclose(added, -np.array(by_hand), atol=2e-3)
+    rigid = torque_of(READY, DQ)
+    added = Effects(model_with(*effects), 1e-6, "bodies")(READY, DQ, STILL, rigid, 5.0)
+    rows = (np.array([x]) for x in (5.0, READY, DQ, STILL))
+    wanted = joint_torque(panda(), effects, *rows)[0]
+    np.testing.assert_allclose(added, rigid - wanted, atol=2e-3)
 
 
 def test_friction_goes_with_the_load_of_this_very_step() -> None:

@@ -7,12 +7,14 @@ import json
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
 from adapter.errors import UsageError
 from adapter.view import server as served
 from adapter.view.server import ViewServer, address, bind
+from tests.helpers.live_tools import wait_for
 
 PAGE = "<!doctype html><title>a page</title>"
 
@@ -151,22 +153,22 @@ def test_one_that_takes_nothing_is_let_go(
 ) -> None:
     monkeypatch.setattr(served._Handler, "timeout", 0.5)
     dead = Listener(server, buffer=4096)
-    assert _soon(lambda: server.listeners == 1)
+    assert wait_for(lambda: server.listeners == 1)
     for k in range(60):
         server.newest.put({"frame": json.dumps({"t": k, "filler": "x" * 100_000}).encode()})
         time.sleep(0.01)
-    assert _soon(lambda: server.listeners == 0)
+    assert wait_for(lambda: server.listeners == 0)
     dead.close()
 
 
 def test_so_many_listen_and_no_more(server: ViewServer) -> None:
     many = [Listener(server) for _ in range(served.LISTENERS)]
-    assert _soon(lambda: server.listeners == served.LISTENERS)
+    assert wait_for(lambda: server.listeners == served.LISTENERS)
     assert ask(server, "/events", Host="localhost")[0] == 503
     assert ask(server, "/")[0] == 200
     many.pop().close()
     server.newest.put({"frame": b"{}"})
-    assert _soon(lambda: server.listeners == served.LISTENERS - 1)
+    assert wait_for(lambda: server.listeners == served.LISTENERS - 1)
     for listener in many:
         listener.close()
 
@@ -181,7 +183,13 @@ def test_connections_that_ask_for_nothing_are_ended(server: ViewServer) -> None:
     for connection in idle:
         assert connection.recv(100) == b""  # the first ones too late, the last ones too many
         connection.close()
-    assert _soon(lambda: ask(server)[0] == 200)
+
+    def answers() -> bool:
+        with suppress(OSError):
+            return ask(server)[0] == 200
+        return False
+
+    assert wait_for(answers)
 
 
 def test_a_request_that_is_too_long_is_refused(server: ViewServer) -> None:
@@ -199,15 +207,3 @@ def test_a_port_that_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     assert address(other).startswith("http://127.0.0.1:") and str(port) not in address(other)
     taken.close()
     other.close()
-
-
-def _soon(condition, timeout_s: float = 10.0) -> bool:
-    end = time.monotonic() + timeout_s
-    while time.monotonic() < end:
-        try:
-            if condition():
-                return True
-        except OSError:
-            pass
-        time.sleep(0.02)
-    return False

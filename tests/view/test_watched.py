@@ -23,21 +23,19 @@ from websockets.typing import Subprotocol
 from adapter.cli.display import LiveTable, table_of
 from adapter.control.observer import ContactObserver
 from adapter.learning.settings import LearnerSettings
-from adapter.realtime.loop_board import LoopBoard
 from adapter.realtime.ring import Ring
 from adapter.realtime.session import run_lockstep
 from adapter.realtime.showing import Looker, View
 from adapter.realtime.snapshot import ExternalTorque, SnapshotReader, SnapshotWriter
-from adapter.realtime.timing import Histogram, Timing
+from adapter.realtime.timing import Histogram, LoopBoard, Timing
 from adapter.runs.config import PipelineSettings
 from adapter.runs.live import FIRST_S, Publisher, news_of, single_thread_learner
 from adapter.runs.pipeline import make_front_end
 from adapter.signals.records import stamp_of
 from adapter.view import foxglove_view
 from adapter.view.foxglove_view import FoxgloveView, free_port
-from adapter.view.messages import Messages, encode
 from adapter.view.now import KnownRun, Now, Onlooker
-from adapter.view.page import LivePage, page_of
+from adapter.view.page import LivePage, Messages, encode, page_of
 from adapter.view.server import address, bind
 from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, tab
 from tests.helpers.live_tools import PANDA, parts, simulated_arm

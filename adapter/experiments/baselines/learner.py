@@ -1,4 +1,8 @@
-"""What all baselines have in common: fit, predict, facts; scaled inputs and outputs."""
+"""What all baselines have in common: fit, predict, facts; scaled inputs and outputs; algebra.
+
+Large matrices are in float64: on a GPU where there is one, else by numpy and scipy, whose products
+on a CPU are about twice as fast as torch's.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from scipy import linalg
 
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
@@ -136,3 +142,34 @@ def checked(X: Array, Y: Array | None = None, width: int | None = None) -> Array
         if not np.isfinite(Y).all():
             raise ModelError("Y holds values that are not finite; leave those samples out")
     return x
+
+
+def accelerator() -> torch.device | None:
+    """The GPU; None where there is none."""
+    return torch.device("cuda") if torch.cuda.is_available() else None
+
+
+def gram(table: Array) -> Array:
+    """Tᵀ T of a table T (m, k)."""
+    place = accelerator()
+    if place is None:
+        return np.asarray(table.T @ table)
+    there = torch.from_numpy(table).to(place)
+    return np.asarray((there.T @ there).cpu().numpy())
+
+
+def solve_positive(matrix: Array, right: Array) -> Array:
+    """A⁻¹ B by Cholesky, A (k, k) positive definite and overwritten, B (k, outputs).
+
+    Raises:
+        LinAlgError: A is not positive definite in float64.
+    """
+    place = accelerator()
+    if place is None:
+        factor = linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+        return np.asarray(linalg.cho_solve(factor, right, check_finite=False))
+    lower, trouble = torch.linalg.cholesky_ex(torch.from_numpy(matrix).to(place))
+    if int(trouble):
+        raise linalg.LinAlgError("the matrix is not positive definite")
+    there = torch.from_numpy(np.ascontiguousarray(right)).to(place)
+    return np.asarray(torch.cholesky_solve(there, lower).cpu().numpy())

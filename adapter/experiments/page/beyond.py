@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.experiments.page.figure4 import KINDS
+from adapter.experiments.page.atlas_figures import KINDS
 from adapter.experiments.page.words import grouped, scientific, with_unit
 from adapter.experiments.results import AtlasResults, PandaResults
 from adapter.gap.phrases import listed
@@ -29,7 +29,6 @@ from adapter.report.style import (
 from adapter.report.tables import Table
 from adapter.runs.score import TORQUE_GOAL
 
-DECADE = 10.0  # largest over smallest value from which a plot is logarithmic
 SECONDS = "seconds of motion learned from"
 Line = tuple[str, Array, str]  # name, values, colour
 
@@ -144,7 +143,7 @@ def _plot(t: Array, lines: Sequence[Line], goal: float | None) -> Drawing:
         ax.plot(t, values, color=color, linewidth=1.2, marker="o", markersize=2.8, label=name)
     if len(shown):
         low, high = float(shown.min()), max(float(shown.max()), goal or 0.0)
-        if goal is None or high > DECADE * low:
+        if goal is None or high > 10.0 * low:  # less is plotted linearly
             log_axis(ax, 0.5 * min(low, goal or low), 4.0 * high)
         else:
             ax.set_ylim(0.0, 1.35 * high)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from adapter.experiments.results import PandaResults
 from adapter.model.spatial import Array
-from adapter.report.schema_panels import FIRST_S, rotation_path
+from adapter.report.learned_panels import FIRST_S, GROUPS, rotation_path
 from adapter.report.style import (
     ACCENT,
     INK,
@@ -22,11 +22,8 @@ from adapter.report.style import (
     thin,
     time_axis,
 )
-from adapter.report.torque_panels import GROUPS
 from adapter.runs.score import TORQUE_GOAL
 
-EARLY_SHARE = 0.2  # θ's start before this share of the run makes time logarithmic
-WORDS_SHARE = 0.08  # of a panel's height, on top, for the words of the mark
 TITLES = (
     ("(a) λ: orientation of the joint frames", "rad", slice(0, 3)),
     ("(a) λ: position of the joint frames", "m", slice(3, 6)),
@@ -99,7 +96,7 @@ def torque_panel(panda: PandaResults) -> Panel | None:
 
 def logarithmic(panda: PandaResults) -> bool:
     """Whether time is drawn logarithmic: what there is to see comes early."""
-    return not panda.theta_start_s > EARLY_SHARE * float(panda.time_s[-1])
+    return not panda.theta_start_s > 0.2 * float(panda.time_s[-1])
 
 
 def _first(panda: PandaResults) -> float:
@@ -131,7 +128,7 @@ def _finish(drawing: Drawing, t: Array, panda: PandaResults) -> None:
     ax: Axes = drawing.axes[0]
     if ax.get_yscale() == "linear":
         low, high = ax.get_ylim()
-        ax.set_ylim(low, high + WORDS_SHARE * (high - low))
+        ax.set_ylim(low, high + 0.08 * (high - low))  # room for the words of the mark
     last = max(float(panda.time_s[-1]), float(t[-1]))
     if logarithmic(panda):
         log_time(ax, FIRST_S, last)

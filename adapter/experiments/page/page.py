@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adapter.experiments.page import figure4, figure5, figure6, words
+from adapter.experiments.page import atlas_figures as figures
+from adapter.experiments.page import figure6, words
 from adapter.experiments.page.beyond import beyond
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.numbers import DASH
-from adapter.report.html import fill, write_whole
+from adapter.report.html import fill
 from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW
@@ -42,18 +42,6 @@ def render_experiment(atlas: AtlasResults | None, panda: PandaResults | None, wr
     return fill("experiment.html", context(atlas, panda, written), "adapter.experiments")
 
 
-def write_experiment(
-    path: str | Path, atlas: AtlasResults | None, panda: PandaResults | None, written: str
-) -> Path:
-    """Write the page, whole or not at all. Returns the path. See `render_experiment`.
-
-    Raises:
-        RunFolderError: the file cannot be written.
-        ValueError: results whose shapes do not fit their tree.
-    """
-    return write_whole(path, render_experiment(atlas, panda, written))
-
-
 def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str) -> dict[str, Any]:
     """What the template shows."""
     shown = [*(atlas_tiles(atlas) if atlas else []), *(panda_tiles(panda) if panda else [])]
@@ -70,7 +58,7 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
         "atlas": None if atlas is None else _atlas(atlas),
         "panda": None if panda is None else _panda(panda),
         "beyond": beyond(atlas, panda),
-        "sets": list(figure5.SET_NAMES.items()),
+        "sets": list(figures.SET_NAMES.items()),
         "written": written,
     }
 
@@ -108,20 +96,20 @@ def panda_tiles(panda: PandaResults) -> list[Tile]:
 
 
 def _atlas(atlas: AtlasResults) -> dict[str, Any]:
-    histogram, moments = figure4.histogram_panels(atlas)
-    paper, others = figure5.arm_panels(atlas)
-    summary = figure5.side_by_side(atlas)
+    histogram, moments = figures.histogram_panels(atlas)
+    paper, others = figures.arm_panels(atlas)
+    summary = figures.side_by_side(atlas)
     tuning = [(x.name, x.title.rstrip("."), words.sentences(x.tuning)) for x in atlas.learners]
     return {
         "n": atlas.tree.n,
-        "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figure4.limbs(atlas.tree)],
-        "schema": [*figure4.epoch_panels(atlas), *([histogram] if histogram else [])],
-        "schema_more": [*([moments] if moments else []), *figure4.schema_panels(atlas)],
+        "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figures.limbs(atlas.tree)],
+        "schema": [*figures.epoch_panels(atlas), *([histogram] if histogram else [])],
+        "schema_more": [*([moments] if moments else []), *figures.schema_panels(atlas)],
         "not_converged": _not_converged(atlas),
         "paper": paper,
-        "whole": figure5.whole_panels(atlas),
+        "whole": figures.whole_panels(atlas),
         "others": others,
-        "last": [figure5.arm_panel(atlas), *([summary] if summary else [])],
+        "last": [figures.arm_panel(atlas), *([summary] if summary else [])],
         "arm": arm_joints(atlas),
         "not_judged": _not_judged(atlas),
         "compared": bool(words.baselines(atlas)),
@@ -151,7 +139,7 @@ def _not_converged(atlas: AtlasResults) -> str:
 
 def _not_judged(atlas: AtlasResults) -> str:
     """Why some joints have no box in Fig. 5; empty where all have one."""
-    joints = figure5.not_judged(atlas)
+    joints = figures.not_judged(atlas)
     if not joints:
         return ""
     names = listed([f"{j + 1} ({atlas.tree.joint_names[j]})" for j in joints])
@@ -180,7 +168,7 @@ def _atlas_reasons(atlas: AtlasResults) -> list[str]:
     kept = {label for label, _ in atlas.snapshots}
     if not atlas.snapshots:
         reasons.append("Fig. 4a-d: no epochs of λ's training were kept.")
-    for label, which in figure4.EPOCH_LETTERS.items():
+    for label, which in figures.EPOCH_LETTERS.items():
         if kept and label not in kept:
             reasons.append(f"Fig. 4{which}: λ's training has no {label}, it ended before.")
     if not any(sum(counts) for counts in atlas.error_counts.values()):

@@ -42,9 +42,9 @@ def with_unit(value: float | int | None, unit: str, digits: int = 2) -> str:
     return f"{scientific(value, digits)} {unit}".replace(" ", NARROW).rstrip(NARROW)
 
 
-def percent(fraction: float | None, digits: int = 2) -> str:
+def percent(fraction: float | None) -> str:
     """A relative error (eq. 20) in per cent."""
-    return with_unit(None if fraction is None else 100.0 * fraction, "%", digits)
+    return with_unit(None if fraction is None else 100.0 * fraction, "%")
 
 
 def grouped(value: int) -> str:
@@ -87,8 +87,6 @@ def ours_text(item: Stated) -> str:
     value = item.ours
     if value is None:
         return "not run"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
     if isinstance(value, str):
         return value
     if isinstance(value, int) or (value.is_integer() and abs(value) < PLAIN_TO):
@@ -134,7 +132,7 @@ def measured(items: Sequence[Stated], key: str) -> float | None:
     """Our value of the figure with that key, if it is a finite number."""
     item = of(items, key)
     value = None if item is None else item.ours
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not isinstance(value, int | float) or not math.isfinite(value):
         return None
     return float(value)
 

@@ -24,8 +24,6 @@ AT_HAND = 2  # tasks of each process: one that it does, and the next
 ON_CLUSTER = 1000  # tasks that the scheduler knows of at once
 ANSWER_S, WORKER_S = 10.0, 60.0  # until nobody is there; until no worker is
 CONNECTIONS = 3  # with a scheduler that is lost again and again
-DIED = f"the process that read it died, {TRIES + 1} times"
-LOADED_ONCE = "adapter.runs.fleet.moments"  # for all processes, where the system can fork
 
 
 def here(function: Callable[[Task], Result], tasks: Sequence[Task], workers: int) -> Done[Result]:
@@ -75,7 +73,7 @@ def _alone(function: Callable[[Task], Result], task: Task) -> Result | Broken:
                 return pool.submit(function, task).result()
             except BrokenProcessPool:
                 continue
-    return Broken(task.path, DIED)
+    return Broken(task.path, f"the process that read it died, {TRIES + 1} times")
 
 
 def _processes(count: int) -> ProcessPoolExecutor:
@@ -86,7 +84,7 @@ def _processes(count: int) -> ProcessPoolExecutor:
     forks = "forkserver" in multiprocessing.get_all_start_methods()
     context = multiprocessing.get_context("forkserver" if forks else "spawn")
     if forks:
-        context.set_forkserver_preload([LOADED_ONCE])
+        context.set_forkserver_preload(["adapter.runs.fleet.moments"])
     return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent)
 
 

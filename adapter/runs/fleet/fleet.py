@@ -16,8 +16,16 @@ from adapter.model import model_file
 from adapter.model.self_model import SelfModel
 from adapter.runs.fleet.arm import FleetArm, learn_arm
 from adapter.runs.fleet.engine import here, on_cluster
-from adapter.runs.fleet.moments import Broken, LogMoments, Task, content_of, moments_of, opened
-from adapter.runs.fleet.store import Store, mark_of
+from adapter.runs.fleet.moments import (
+    Broken,
+    LogMoments,
+    Store,
+    Task,
+    content_of,
+    mark_of,
+    moments_of,
+    opened,
+)
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.names import RECORDINGS, is_recording
 

@@ -1,4 +1,4 @@
-"""Moments of one recording: all that a fleet keeps of it.
+"""Moments of one recording, all that a fleet keeps of it, and where it keeps them.
 
 They are taken with the λ of the model and add up (eq. 19): of how many recordings, in which order
 and on which machine does not matter, and leaving one out of the sum forgets it.
@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import os
 import tempfile
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -37,7 +39,7 @@ from drivers.files.mcap import Log, read_log
 from drivers.interface import DriverError
 
 FORMAT = 1  # of the files of moments; another one is computed anew
-READ_AT_ONCE = 1 << 20  # bytes
+SEEN, FOLDER, GONE = "seen.jsonl", "moments", ".forgotten"
 ARM_KEYS = ("arm", "serial", "serial_number", "robot_serial", "arm_id")  # in a log's metadata
 
 
@@ -133,7 +135,7 @@ def _content(path: Path) -> str:
         if path.is_dir():
             digest.update(str(file.relative_to(path)).encode() + b"\0")
         with file.open("rb") as opened:
-            while block := opened.read(READ_AT_ONCE):
+            while block := opened.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
 
@@ -246,3 +248,121 @@ def _broken(path: str, error: Exception) -> Broken:
         told = rest
     expected = isinstance(error, DriverError | OSError | ValueError | MeansError)
     return Broken(path, told if expected and told else f"{type(error).__name__}: {told}")
+
+
+class Store:
+    """What a fleet has learned so far, on disk: moments by the content of log and model.
+
+    Each is written whole once it is there.
+
+    Args:
+        folder: made if it is not there.
+        model: text of the model that the moments are taken with; those of others are not seen.
+    """
+
+    def __init__(self, folder: Path, model: str) -> None:
+        self._folder = folder / FOLDER
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._model = hashlib.sha256(f"{FORMAT}\n{model}".encode()).hexdigest()[:16]
+        self._seen_file = folder / SEEN
+        self._seen = self._read_seen()
+
+    def _path(self, content: str) -> Path:
+        return self._folder / f"{self._model}-{content}.npz"
+
+    def _read_seen(self) -> dict[str, tuple[str, str]]:
+        """Marks and contents by path: a line each, the last one counts, a torn one does not."""
+        seen: dict[str, tuple[str, str]] = {}
+        try:
+            text = self._seen_file.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return seen  # it saves reading recordings again, no more
+        for line in text.splitlines():
+            try:
+                path, mark, content = json.loads(line)
+            except (ValueError, TypeError):
+                continue
+            seen[path] = mark, content
+        return seen
+
+    def content_seen(self, path: str, mark: str) -> str | None:
+        """The content of a recording whose mark was this when it was read, None if unknown."""
+        before, content = self._seen.get(path, ("", ""))
+        return content if mark and mark == before else None
+
+    def remember(self, path: str, mark: str, content: str) -> None:
+        """Keep the content of a recording, so that it is not read again while it does not change.
+
+        Args:
+            mark: as it was before it was read, see `mark_of`.
+        """
+        if mark and self._seen.get(path) != (mark, content):
+            self._seen[path] = mark, content
+            with self._seen_file.open("a", encoding="utf-8") as file:
+                file.write("\n" + json.dumps([path, mark, content]))
+
+    def places(self) -> dict[str, str]:
+        """Where contents were seen last."""
+        return {content: path for path, (_, content) in self._seen.items()}
+
+    def has(self, content: str) -> bool:
+        """Whether nothing is to be done for it: its moments are there, or it was forgotten."""
+        return self._path(content).exists() or self.forgotten(content)
+
+    def forgotten(self, content: str) -> bool:
+        """Whether it must not count."""
+        return self._path(content).with_suffix(GONE).exists()
+
+    def add(self, moments: LogMoments) -> None:
+        """Keep moments."""
+        moments.save(self._path(moments.content))
+
+    def forget(self, contents: Iterable[str]) -> None:
+        """Leave recordings out from here on, though they are given again."""
+        for content in contents:
+            self._path(content).with_suffix(GONE).touch()
+            self._path(content).unlink(missing_ok=True)
+
+    def recall(self, contents: Iterable[str]) -> None:
+        """Take back what `forget` did; they are read again when they are given."""
+        for content in contents:
+            self._path(content).with_suffix(GONE).unlink(missing_ok=True)
+
+    def heads(self) -> list[LogMoments]:
+        """All that is known, without the moments themselves, in the order of content.
+
+        What was damaged is taken away, so that its recording is read again.
+        """
+        paths = sorted(self._folder.glob(f"{self._model}-*.npz"))
+        return [x for x in (self._read(path, False) for path in paths) if x is not None]
+
+    def whole(self, heads: Iterable[LogMoments]) -> list[LogMoments]:
+        """These with their moments."""
+        found = (self._read(self._path(head.content), True) for head in heads)
+        return [x for x in found if x is not None]
+
+    def _read(self, path: Path, whole: bool) -> LogMoments | None:
+        try:
+            return LogMoments.load(path, whole)
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            path.unlink(missing_ok=True)
+            return None
+
+
+def mark_of(path: str) -> str:
+    """What changes with a recording's content and is known without reading it, "" if nothing is.
+
+    Size and time of change of a file, or of all files in a folder; behind an address what its file
+    system knows (an ETag, a version, a time).
+    """
+    try:
+        if "://" in path:
+            filesystem, inside = opened(path)
+            files = filesystem.find(inside) if filesystem.isdir(inside) else [inside]
+            said = [(str(file), str(filesystem.ukey(file))) for file in files]
+        else:
+            stats = [(str(file), os.stat(file)) for file in files_of(Path(path))]
+            said = [(name, f"{x.st_size} {x.st_mtime_ns} {x.st_ino}") for name, x in stats]
+    except (OSError, ValueError, RuntimeError, NotImplementedError):
+        return ""
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:32]

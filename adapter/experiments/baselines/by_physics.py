@@ -1,34 +1,39 @@
-"""A deep Lagrangian network (Lutter, Ritter, Peters 2019) for an arm on a moving link.
+"""Two learners that know mechanics: a deep Lagrangian network, and least squares with known λ.
 
-A network gives the mass matrix M(q) of the arm's joints and its carrier, positive definite by
-its Cholesky factor; the rest is mechanics. The kinetic energy is T = ½ xᵀ M(q) x with
-x = [V; dq], V the carrier's twist [v; w] in its own axes. The joints are true coordinates, so
+The deep Lagrangian network (Lutter, Ritter, Peters 2019) is that of an arm on a moving link. It
+gives the mass matrix M(q) of the arm's joints and its carrier, positive definite by its Cholesky
+factor; the rest is mechanics. The kinetic energy is T = ½ xᵀ M(q) x with x = [V; dq], V the
+carrier's twist [v; w] in its own axes. The joints are true coordinates, so
 
     τ = d/dt (∂T/∂dq) - ∂T/∂q,    dV/dt = [a - w × v; dw],
 
 with `a` the accelerometer's reading: seen from a frame in free fall there is no potential.
 Torques don't depend on v, so the frame may fly along with the carrier: v = 0 and dV/dt = [a; dw].
 This is how the network is trained; it then obeys Galilei's relativity without learning it.
+
+Least squares on the regressor is what a user would take today, and no baseline of the paper: it is
+told the body schema, which all other learners have to do without or find. It shows what the data
+hold.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from adapter.experiments.baselines.dense import accelerator
 from adapter.experiments.baselines.features import Columns
-from adapter.experiments.baselines.learner import Baseline, Progress, Told
+from adapter.experiments.baselines.learner import Baseline, Progress, Told, accelerator
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.spatial import Array
-from adapter.physics.networks import FrameMotion
+from adapter.model.tree import Tree
+from adapter.physics.identifiability import RANK_TOLERANCE
+from adapter.physics.networks import DTYPE, PER_BODY, FrameMotion, regressor
 
 BASE_ROWS = 6  # [v; w] of the carrier come before the joints in x
-FIRST_ANSWERS = 0.1  # gain of the last layer's first weights
 LEAST_DIAGONAL = 1e-3  # of the scaled Cholesky factor, so that M stays invertible
 
 MassMatrix = Callable[[Tensor], Tensor]
@@ -78,7 +83,7 @@ class MassNetwork(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         layers = [nn.Linear(ins, outs) for ins, outs in pairwise(sizes)]
         for layer in layers:
-            gain = FIRST_ANSWERS if layer is layers[-1] else 1.0
+            gain = 0.1 if layer is layers[-1] else 1.0  # first answers are small
             nn.init.xavier_normal_(layer.weight, gain, generator=generator)
             nn.init.zeros_(layer.bias)
         self.inner, self.last = nn.ModuleList(layers[:-1]), layers[-1]
@@ -184,3 +189,63 @@ class DeepLagrangian(Baseline):
         place = self._mass.last.weight.device
         torque = self._torque(self._mass, torch.from_numpy(x).float().to(place))
         return torque.detach().double().cpu().numpy()
+
+
+class RegressorLeastSquares(Baseline):
+    """Inertial parameters of an arm from its torques, weighted by joint, smallest norm."""
+
+    at_once = 5_000  # so that their regressor stays below 30 MB
+
+    def __init__(self, columns: Columns, parents: Sequence[int], lam: Array) -> None:
+        """With a known body schema.
+
+        Args:
+            columns: layout of X.
+            parents: for each joint of the arm the arm's link that it hangs on, -1 for the
+                carrier (`features.sub_parents`).
+            lam: (n, 6) λ of these joints.
+        """
+        self.tree = Tree(tuple(parents), floating=True)
+        self.columns, self.lam = columns, torch.as_tensor(np.asarray(lam), dtype=DTYPE)
+
+    def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
+        """Solve with equal weights, then with each joint's rest as its noise."""
+        self.columns.check(X, Y)
+        width = PER_BODY * self.tree.n + 1
+        triangles: list[Array] = [np.zeros((0, width)) for _ in range(self.tree.n)]
+        for k in range(0, len(X), self.at_once):
+            rows = self._rows(X[k : k + self.at_once])
+            for j, old in enumerate(triangles):
+                new = np.column_stack([rows[:, j], Y[k : k + self.at_once, j]])
+                triangles[j] = np.asarray(np.linalg.qr(np.vstack([old, new]), mode="r"))
+            progress(f"least squares: {min(k + self.at_once, len(X))} of {len(X)} samples")
+        size = np.maximum(np.sqrt(np.mean(Y**2, axis=0)), 1e-9)
+        theta, rank = _solved(triangles, size)
+        rest = [np.linalg.norm(r[:, :-1] @ theta - r[:, -1]) for r in triangles]
+        # no joint's torque is taken for better than this share of its size
+        noise = np.maximum(np.array(rest) / np.sqrt(len(X)), 1e-12 * size)
+        self._theta, rank = _solved(triangles, noise)
+        return {"samples": len(X), "parameters": PER_BODY * self.tree.n, "rank": rank}, (
+            "λ is known; θ by weighted least squares (QR), the weights from each joint's rest, "
+            "the solution of smallest norm.",
+        )
+
+    def _rows(self, x: Array) -> Array:
+        """Regressor of the joint torques, (m, n, 10 n); the carrier's own inertia is in none."""
+        q, dq, ddq = (torch.from_numpy(np.ascontiguousarray(s)) for s in self.columns.joints(x))
+        full = regressor(
+            self.tree, self.lam, (q, dq, ddq), FrameMotion.of(self.columns.carrier(x).rows())
+        )
+        return full[:, 6:, PER_BODY:].numpy()
+
+    def _answer(self, x: Array) -> Array:
+        return np.asarray(self._rows(x) @ self._theta)
+
+
+def _solved(triangles: list[Array], noise: Array) -> tuple[Array, int]:
+    """θ (10 n,) of the joints' triangular systems, each over its noise; and the rank found."""
+    table = np.vstack([r / s for r, s in zip(triangles, noise, strict=True)])
+    length = np.linalg.norm(table[:, :-1], axis=0)
+    length = np.where(length > 0.0, length, 1.0)
+    found, _, rank, _ = np.linalg.lstsq(table[:, :-1] / length, table[:, -1], rcond=RANK_TOLERANCE)
+    return found / length, int(rank)

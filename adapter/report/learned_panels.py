@@ -1,8 +1,8 @@
-"""Panels of torque: θ over time, the error before learning, and the fit joint by joint."""
+"""Panels over time: the body schema λ, θ and its effects, torque errors, and the fit by joint."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from adapter.effects import effects_by_name
 from adapter.gap.phrases import SHOWN_UNITS
 from adapter.model.inertia import PARAMETERS
-from adapter.model.spatial import Array
+from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
 from adapter.report.style import (
     ACCENT,
     GOAL,
@@ -20,7 +20,10 @@ from adapter.report.style import (
     Drawing,
     Panel,
     joint_color,
+    level,
     lines_by_joint,
+    log_axis,
+    log_time,
     mark,
     named,
     thin,
@@ -28,8 +31,19 @@ from adapter.report.style import (
     time_axis,
 )
 from adapter.runs.run_folder import RunData
-from adapter.runs.score import TORQUE_GOAL, TORQUE_WINDOW_S, trailing_rms
+from adapter.runs.score import (
+    POSITION_GOAL_M,
+    ROTATION_GOAL_RAD,
+    TORQUE_GOAL,
+    TORQUE_WINDOW_S,
+    trailing_rms,
+)
 
+DASHES: Sequence[tuple[float, Sequence[float]]] = ((0, ()), (0, (4, 1.5)), (0, (1, 1.3)))  # x, y, z
+SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time to converge
+FIRST_S = 0.05  # left end of a logarithmic time axis
+LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
+SETTLED = "inside both goals"
 SHOWN_FIT_S = 20.0  # of the end of the run
 SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
 SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the panel
@@ -38,6 +52,84 @@ GROUPS = (("kg", (0,)), ("kg m", (1, 2, 3)), ("kg m²", (4, 7, 9, 5, 6, 8)))  # 
 COLOR_OF = (7, 0, 1, 2, 0, 3, 4, 1, 5, 2)  # of each parameter, as of a joint of that number
 BODY_PARTS = ((8, "m"), *enumerate(("mX, XX", "mY, YY", "mZ, ZZ", "XY", "XZ", "YZ"), start=1))
 MOST_ROWS = 160  # along a line of a small panel
+
+
+def schema_panels(data: RunData) -> list[Panel]:
+    """λ over time (the paper's Fig. 6a), and its errors where there is a reference."""
+    t = data.times(data.schema_trace)
+    lam = data.schema_trace[:, 1:].reshape(-1, data.n, 6)
+    if len(t) < 2:
+        return []
+    converged = data.converged_s("lambda")
+    # most happens at first: values are shown up to here, errors to the end
+    until = t[-1] if converged is None else min(t[-1], max(SHOWN_S, SHOWN_FACTOR * converged))
+    early, values = thin_rows(t[t <= until], lam[t <= until])
+    shown = "" if until == t[-1] else f"; the first {until:.2g} of {t[-1]:.3g} s"
+    note = f"in its parent's, x solid, y dashed, z dotted{shown}"
+    turns, shifts = rotation_path(values), values[..., 3:]
+    panels = [
+        _components(early, turns, converged).panel(
+            "Orientation of the joint frames", "rad", f"rotation vector of each frame {note}"
+        ),
+        _components(early, shifts, converged).panel(
+            "Position of the joint frames", "m", f"origin of each frame {note}"
+        ),
+    ]
+    if data.reference is None:
+        return panels
+    goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")
+    titles = "Orientation error", "Position error"
+    for title, error, (goal, unit) in zip(titles, data.schema_errors, goals, strict=True):
+        drawing = _errors(t, error, goal, unit, converged)
+        panels.append(drawing.panel(title, unit, "in what the data had shown by then"))
+    return panels
+
+
+def rotation_path(lam: Array) -> Array:
+    """Rotation vectors (k, n, 3) of λ (k, n, 6) over time, without jumps at half a turn.
+
+    A rotation by a about u is one by a - 2π about u too; the one nearer to the row before is
+    taken.
+    """
+    path = log_rotation(matrix_from_zxz(lam[..., :3]))
+    for k in range(1, len(path)):
+        length = np.linalg.norm(path[k], axis=-1, keepdims=True)
+        other = path[k] * (1.0 - 2.0 * np.pi / np.maximum(length, 1e-9))
+        stay, turn = (np.linalg.norm(x - path[k - 1], axis=-1) for x in (path[k], other))
+        path[k] = np.where(((turn < stay) & (length[..., 0] > 1e-6))[..., None], other, path[k])
+    return path
+
+
+def _components(t: Array, values: Array, converged: float | None) -> Drawing:
+    """Values (k, n, 3): a colour per joint, a dash per axis."""
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    for j in range(values.shape[1]):
+        for axis, dashes in enumerate(DASHES):
+            name = named(f"joint {j + 1} {'xyz'[axis]}")
+            (line,) = ax.plot(t, values[:, j, axis], gid=name, color=joint_color(j), linewidth=1.0)
+            line.set_linestyle(dashes)
+    ax.set_xlim(min(0.0, t[0]), t[-1])
+    ax.margins(y=0.12)  # room for the words of the mark
+    mark(ax, converged, SETTLED)
+    time_axis(drawing)
+    return drawing
+
+
+def _errors(t: Array, error: Array, goal: float, unit: str, converged: float | None) -> Drawing:
+    """Errors (k, n) on logarithmic axes, with their goal."""
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    top = max(float(error.max()), 10 * goal)
+    shown = t >= FIRST_S
+    lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST))
+    log_axis(ax, LOWEST, 2 * top)
+    log_time(ax, FIRST_S, t[-1])
+    late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
+    level(ax, goal, f"goal {goal:g} {unit}", left=late)
+    mark(ax, converged, SETTLED)
+    time_axis(drawing)
+    return drawing
 
 
 def change_times(data: RunData) -> list[float]:
@@ -120,13 +212,11 @@ def _finish(drawing: Drawing, t: Array, data: RunData) -> None:
     time_axis(drawing)
 
 
-def prequential_panels(data: RunData) -> list[Panel]:
-    """Torque error of each sample before it was learned from, against batch least squares."""
-    return [_against_batch(data), _by_joint(data)]
+def error_panel(data: RunData) -> Panel:
+    """Torque error of each sample before it was learned from, against batch least squares.
 
-
-def _against_batch(data: RunData) -> Panel:
-    """In units of each joint's noise, as convergence is judged; up to the first change."""
+    In units of each joint's noise, as convergence is judged; up to the first change.
+    """
     t = data.times(data.score_trace)
     _, _, _, tau, error = data.score_signals()
     changes = change_times(data)
@@ -154,7 +244,8 @@ def _against_batch(data: RunData) -> Panel:
     )
 
 
-def _by_joint(data: RunData) -> Panel:
+def error_by_joint(data: RunData) -> Panel:
+    """The same of each joint, in N m."""
     t = data.times(data.score_trace)
     error = data.score_signals()[4]
     drawing = Drawing("half")

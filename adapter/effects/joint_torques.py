@@ -1,4 +1,4 @@
-"""Joint spring: k (q - q0), a cable or hose that pulls."""
+"""Torques of a joint beside friction: by its angle, or by its acceleration."""
 
 from __future__ import annotations
 
@@ -12,20 +12,79 @@ from adapter.effects.base import (
     JointSignals,
     JointTorque,
     LearnedEffect,
+    LinearEffect,
     Parameter,
     Template,
     Values,
+    polar,
 )
-from adapter.effects.phrases import Phrase
-from adapter.effects.splits import TURN
-from adapter.model.urdf_text import STIFFNESS, Additions
+from adapter.effects.law import LOG_ODDS
+from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
+from adapter.model.urdf_text import ARMATURE, STIFFNESS, Additions
+
+
+class MotorInertia(LinearEffect):
+    """Torque that speeds the joint's own rotor up, seen at the joint ("armature"): tau = B ddq."""
+
+    name = "motor_inertia"
+    title = "reflected motor inertia"
+    parameters = (Parameter("B", "kg m2"),)
+    prior_std = 0.1  # a link-side sensor should see none; catalogue sizes are 0.05 to 0.3
+    place = ARMATURE  # which MJCF has and URDF has not
+    positive = ("B",)
+    phrase = Phrase.lacks("B", "reflected motor inertia")
+    shows = ((SPEEDS, "is gone"), (STILL, "is gone"))
+    watched = True
+    bundled = True
+
+    def column(self, at: JointSignals) -> Array:
+        """ddq."""
+        return at.ddq
+
+
+# Harmonic drives and motors give 1, 2, 4 and the numbers of poles and rollers.
+NUMBERS = tuple(range(1, 31))
+
+
+class TorqueRipple(JointTorque):
+    """A torque that repeats with the joint's angle: a sin(n q + phase), n whole, per turn."""
+
+    name = "torque_ripple"
+    title = "torque ripple"
+    parameters = (
+        Parameter("a", "N m"),
+        Parameter("n", "per turn", lower=0.0),
+        Parameter("phase", "rad"),
+    )
+    inexact = 0.01
+    phrase = Phrase("{who} {has} a torque ripple of {a}, {n}")
+    shows = ((TURN, "repeats along the turn"),)
+    over_angle = True
+
+    def templates(self) -> tuple[Template, ...]:
+        """Sine and cosine of each number per turn."""
+        return tuple(Template((0.3, 0.3), partial(self.decode, n=n), f"n = {n}") for n in NUMBERS)
+
+    def decode(self, x: Array, n: int = 1) -> dict[str, Any]:
+        """Of sine and cosine of n turns."""
+        size, phase = polar(x)
+        return {"a": size, "n": float(n), "phase": phase}
+
+    def log_odds_over(self, values: Values, turned: float) -> float:
+        """Less than a whole wave may be any curve over the angle, which has no name."""
+        return 0.0 if values["n"] * turned > 2.0 * np.pi else LOG_ODDS
+
+    def law(self, at: JointSignals, values: Values) -> Array:
+        """a sin(n q + phase)."""
+        return np.asarray(values["a"] * np.sin(values["n"] * at.q + values["phase"]))
+
 
 # Farther from zero no joint's spring rests, unless it is at zero but for an offset so small
 FARTHEST_RAD, NOTHING_NM = np.pi, 0.02
 
 
 class JointSpring(LearnedEffect, JointTorque):
-    """A spring between a joint's two sides.
+    """A spring between a joint's two sides, as a cable or hose that pulls: k (q - q0).
 
     The learner has one that rests at zero; where it rests is in the offset that it learns beside.
     """
