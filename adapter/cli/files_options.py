@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 
 from adapter.cli import options
@@ -13,8 +14,9 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Turn tables (CSV, white space, either packed by gzip, .npz, .parquet, or the folder of a "
-        "LeRobot data set) or a bag (rosbag2, ROS 1, MCAP) into an MCAP recording of our own. "
-        "Sources are one FILE, or of tables SIGNAL=FILE for each of time, q, dq, tau."
+        "LeRobot data set or of SAGE) or a bag (rosbag2, ROS 1, MCAP) into an MCAP recording of "
+        "our own. Sources are one FILE, or of tables SIGNAL=FILE for each of time, q, dq, tau, "
+        "cmd (commanded positions)."
     )
     add = parser.add_argument
     add("sources", nargs="+", metavar="[SIGNAL=]FILE")
@@ -29,6 +31,8 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
         metavar="LIST",
         help="joint names, commas between",
     )
+    said = "joints that are called otherwise: A in the source, B here; LEFT_*=* takes off a prefix"
+    add("--names", type=options.names_in, default=(), metavar="A=B,...", help=said)
     add("--flat", action="store_true", help="one value per line")
     add("--overwrite", action="store_true", help="replace an existing recording")
     options.add_json(parser)
@@ -41,7 +45,16 @@ def _add_tables(parser: argparse.ArgumentParser) -> None:
     add("--columns", default="", metavar="MAP", help="as in time=0,q=1:8,dq=8:15,tau=tau_*")
     add("--units", default="", metavar="MAP", help="as in q=deg,tau=mNm,time=ms")
     add("--period", type=float, metavar="S", help="where there is no time")
+    add("--rate", dest="period", type=_period_of, metavar="HZ", help="the same")
     add("--episode", type=int, metavar="N", help="of a LeRobot data set with several")
+
+
+def _period_of(text: str) -> float:
+    """The period of a rate. Raises ArgumentTypeError."""
+    with suppress(ValueError):
+        if float(text) > 0.0:
+            return 1.0 / float(text)
+    raise argparse.ArgumentTypeError(f"'{text}' is no rate in Hz")
 
 
 def _check_import(args: argparse.Namespace) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -130,9 +129,10 @@ def assembled(
         names = order if isinstance(order, list) else []
         links = assemble_links(topics, names, carrier, sensors)
         found = frame_motions(topics, tell, scan.path, warnings)
-    commands = None
-    if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
-        check_type(topics[JOINT_COMMANDS], scan.path)
+    commands, ordered = None, topics.get(JOINT_COMMANDS)
+    # positions commanded to an arm that tells efforts are of no use beside these
+    if ordered is not None and ordered.count and (asked or not fits(ordered, effort=False)):
+        check_type(ordered, scan.path)
         where = f"{scan.path}: {JOINT_COMMANDS}"
         commands = commands_told(asked, where, rows.names, mapped, warnings)
     log = Log(
@@ -186,8 +186,20 @@ def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
     _, when, commands, _ = _positions(commanded, scan.path, names)
     nothing, warnings = np.full_like(rows, np.nan), scan.warnings + said
     orders = Commands(when, np.full_like(commands, np.nan), commands)
-    log = Log(scan.path, names, at, rows, nothing, nothing, topic=states, warnings=warnings)
-    return replace(log, commands=orders)
+    return Log(
+        scan.path,
+        names,
+        at,
+        rows,
+        nothing,
+        nothing,
+        commands=orders,
+        metadata=_decoded_metadata(scan),
+        topics=_topics_told(topics),
+        topic=states,
+        truncated=scan.truncated,
+        warnings=warnings,
+    )
 
 
 def _positions(
