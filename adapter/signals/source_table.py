@@ -151,13 +151,14 @@ def read_table(path: Path) -> SourceTable:
         names = _split(comments[-1].lstrip("# "), separator)
     if not lines:
         raise DriverError(f"{path}: holds a header ({', '.join(names)}) and no numbers")
+    units = [match[1].strip() if (match := _UNIT.search(name)) else "" for name in names]
+    if names and len(lines) > 1 and not any(_numeric(lines[0][1], separator)):
+        below = [word.strip("[]() ") for word in _split(lines.pop(0)[1], separator)]
+        units = below if len(below) == len(names) else units
     if names and len(names) != (count := len(_split(lines[0][1], separator))):
         raise DriverError(
             f"{path}: the header names {len(names)} columns, line {lines[0][0]} has {count} values"
         )
-    units = [match[1].strip() if (match := _UNIT.search(name)) else "" for name in names]
-    if names and len(lines) > 1 and not any(_numeric(lines[0][1], separator)):
-        units = [word.strip("[]() ") for word in _split(lines.pop(0)[1], separator)]
     texts = [text if separator == "," else text.replace(",", ".") for _, text in lines]
     numbers = tuple(number for number, _ in lines)
     try:
