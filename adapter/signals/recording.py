@@ -101,13 +101,18 @@ def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
 
 def _read(path: Path, topic: str | None) -> Log:
     """A recording, also one of commanded and measured positions alone. Raises DriverError."""
+    log, trouble = None, None
     try:
-        return read_log(path, topic=topic, beside="frames")
-    except DriverError:
+        log = read_log(path, topic=topic, beside="frames")
+    except DriverError as error:
+        trouble = error
+    if log is None or not (log.is_mapped or np.any(np.nan_to_num(log.tau))):
         with suppress(DriverError):  # the first one says what is wrong
-            if (log := read_position_log(path, topic)) is not None:
-                return log
-        raise
+            log = read_position_log(path, topic) or log
+    if log is None:
+        assert trouble is not None
+        raise trouble
+    return log
 
 
 def _of_servos(log: Log) -> bool:

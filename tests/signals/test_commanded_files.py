@@ -8,7 +8,7 @@ import pytest
 
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
-from drivers.files.mcap import read_log, read_position_log
+from drivers.files.mcap import McapWriter, read_log, read_position_log
 from tests.helpers.bags import Motion, write_ros2
 
 TIME = np.arange(500) * 0.02
@@ -115,6 +115,15 @@ def test_a_folder_of_sage_and_what_is_said_of_it(tmp_path, capsys):
         for words in ("500 commanded positions", "rms: 30  50 mrad", "no efforts", "the servos"):
             assert words in said
         assert "problem" not in said and f"adapter gap {told} --model panda" in said
+
+
+def test_efforts_of_zero_are_none(tmp_path, capsys):
+    with McapWriter(tmp_path / "a.mcap", ("a", "b")) as writer:
+        for k in range(len(TIME)):
+            writer.write_joint_state(k * 20_000_000, Q[k], 0 * Q[k], 0 * Q[k])
+            writer.write_position_command(k * 20_000_000, CMD[k])
+    assert main(["info", str(tmp_path / "a.mcap")]) == 0
+    assert "rms: 30  50 mrad" in capsys.readouterr().out
 
 
 def test_names_of_joints(tmp_path, capsys):
