@@ -100,10 +100,11 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Write a model as URDF or MJCF. Onto the robot's file (INPUT, or by default the one that "
         "the model came from) only what was learned is written: inertials, places of joints, "
-        "friction; every other byte stays as it is."
+        "friction; every other byte stays as it is. Or write a recording as a data set of LeRobot."
     )
     add = parser.add_argument
-    add("model", type=Path, metavar="MODEL", help="model file (.json)")
+    add("model", type=Path, metavar="MODEL|LOG", help="model file (.json), or a recording")
+    add("--lerobot", type=Path, metavar="FOLDER", help="of LOG: a data set, version 3, to write")
     add("--urdf", type=Path, metavar="FILE", help="to write")
     add("--mjcf", type=Path, metavar="FILE", help="to write")
     onto = parser.add_mutually_exclusive_group()
@@ -120,6 +121,10 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_export(args: argparse.Namespace) -> None:
+    if args.lerobot is not None:
+        if args.urdf or args.mjcf or args.onto or args.alone:
+            raise UsageError("--lerobot is for a recording and goes with no other file")
+        return
     if args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:

@@ -273,12 +273,14 @@ class SourceReader:
 
     def _usual(self, table: SourceTable, signal: str) -> list[int]:
         """Places of the columns whose header names a signal."""
-        places = table.found(_LEROBOT.get(signal, ""))
-        places = places or [i for i, name in enumerate(table.names) if _names(signal, name)]
+        known = table.found(_LEROBOT.get(signal, ""))
+        places = known or [i for i, name in enumerate(table.names) if _names(signal, name)]
         places = [i for i in places if not table.is_text(i)][: 1 if signal == "time" else None]
         names = [re.sub(r"\[\d+\]$", "", table.names[i]) for i in places]
         self.called[signal] = ",".join(dict.fromkeys(names))
-        if any(re.search(r"[^\W\d_]+[\W_]+[^\W\d_]", name) for name in names):  # more than a word
+        if not known and any(
+            re.search(r"[^\W\d_]+[\W_]+[^\W\d_]", name) for name in names
+        ):  # more than a word
             self._say(f"{table.path}: {signal} is taken to be {self.called[signal]}")
         return places
 
