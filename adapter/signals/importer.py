@@ -78,16 +78,13 @@ def import_file(spec: ImportSpec, out: Path) -> ImportReport:
         version = importlib.metadata.version("panda-adapter")
     except importlib.metadata.PackageNotFoundError:
         version = "unknown"
-    recorded = False
-    for signal, path in spec.sources.items():
-        here = is_recording(path) and not is_data_set(Path(path))
-        if here and signal != ALL:
-            raise DriverError(
-                f"{path}: is a recording with all signals; write it without {signal}="
-            )
-        recorded = recorded or here
-        if spec.topic is not None and not recorded:
-            raise DriverError(f"{path}: is no recording, so it has no topic {spec.topic}")
+    recorded = [s for s, x in spec.sources.items() if is_recording(x) and not is_data_set(Path(x))]
+    if any(recorded):
+        path = spec.sources[next(filter(None, recorded))]
+        raise DriverError(f"{path}: is a recording with all signals; write it without SIGNAL=")
+    if spec.topic is not None and not recorded:
+        path = next(iter(spec.sources.values()))
+        raise DriverError(f"{path}: is no recording, so it has no topic {spec.topic}")
     log = recording_log(spec) if recorded else table_log(spec)
     source = {
         "files": {signal or "all": Path(path).name for signal, path in spec.sources.items()},

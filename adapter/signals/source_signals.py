@@ -16,7 +16,6 @@ from drivers.errors import choices
 from drivers.files.mcap import Commands
 from drivers.interface import Array, DriverError
 
-SIGNALS = ("time", "q", "dq", "tau", "cmd")
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "q": {"rad": 1.0, "deg": np.pi / 180},
@@ -24,6 +23,7 @@ UNITS: dict[str, dict[str, float]] = {
     "tau": {"Nm": 1.0, "mNm": 1e-3},
     "cmd": {"rad": 1.0, "deg": np.pi / 180},
 }
+SIGNALS = tuple(UNITS)
 ALL = ""  # the source of every signal that has none of its own
 _TOLD = {  # words of a header that name a signal, and beginnings of such
     "time": ({"t"}, ("time", "zeit", "stamp")),
@@ -172,13 +172,26 @@ def refuse_wild(where: str, place: Callable[[int], str], signal: str, values: Ar
         )
 
 
-def _names(signal: str, name: str) -> bool:
-    """Whether the words of a header name a signal and no other one: q_cmd is a command."""
-    words = {x.casefold() for x in re.findall(r"[^\W\d_]+", name)}
-    words |= {x.casefold() for x in re.findall("[A-Z][a-z]{2,}", name)}  # JointPos1
-    starts = {s: any(x.startswith(begins) for x in words) for s, (_, begins) in _TOLD.items()}
-    told = {s for s, (whole, _) in _TOLD.items() if words & whole or starts[s]}
-    return not words & _OTHERS and told - ({"q"} if signal == "cmd" else set()) == {signal}
+def _words(name: str) -> set[str]:
+    """Words of a header without its unit, and those of one like JointPos1."""
+    name = re.split(r"[\[(]", name)[0]
+    words = re.findall(r"[^\W\d_]+", name) + re.findall("[A-Z][a-z]{2,}", name)
+    return {word.casefold() for word in words}
+
+
+def _named(signal: str, names: Sequence[str]) -> tuple[list[int], bool]:
+    """Places of the headers that name a signal and no other one (q_cmd is a command).
+
+    Of those that say nothing else (q1), where there are such; and whether there are.
+    """
+    found = {}
+    for i, words in enumerate(map(_words, names)):
+        starts = {s: any(x.startswith(begins) for x in words) for s, (_, begins) in _TOLD.items()}
+        told = {s for s, (whole, _) in _TOLD.items() if words & whole or starts[s]}
+        if not words & _OTHERS and told - ({"q"} if signal == "cmd" else set()) == {signal}:
+            found[i] = len(words) == 1
+    alone = [i for i, is_alone in found.items() if is_alone]
+    return alone or list(found), bool(alone)
 
 
 class SourceReader:
@@ -273,14 +286,13 @@ class SourceReader:
 
     def _usual(self, table: SourceTable, signal: str) -> list[int]:
         """Places of the columns whose header names a signal."""
-        known = table.found(_LEROBOT.get(signal, ""))
-        places = known or [i for i, name in enumerate(table.names) if _names(signal, name)]
+        places, known = table.found(_LEROBOT.get(signal, "")), True
+        if not places:
+            places, known = _named(signal, table.names)
         places = [i for i in places if not table.is_text(i)][: 1 if signal == "time" else None]
-        names = [re.sub(r"\[\d+\]$", "", table.names[i]) for i in places]
-        self.called[signal] = ",".join(dict.fromkeys(names))
-        if not known and any(
-            re.search(r"[^\W\d_]+[\W_]+[^\W\d_]", name) for name in names
-        ):  # more than a word
+        names = dict.fromkeys(re.sub(r"\[\d+\]$", "", table.names[i]) for i in places)
+        self.called[signal] = ",".join(names)
+        if names and not known:
             self._say(f"{table.path}: {signal} is taken to be {self.called[signal]}")
         return places
 
@@ -309,7 +321,7 @@ class SourceReader:
         arrays = self._arrays[path]
         keys = self._spec.columns[signal] if told else None
         if keys is None:
-            keys = tuple(key for key in arrays if _names(signal, key))[:1]
+            keys = tuple(list(arrays)[i] for i in _named(signal, list(arrays))[0][:1])
         elif len(keys) != 1 or keys[0] not in arrays:
             raise DriverError(
                 f"{path}: no array '{','.join(keys)}' for {signal}; have: {', '.join(arrays)}"
