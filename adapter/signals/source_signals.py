@@ -256,6 +256,7 @@ class SourceReader:
             having = f"its arrays: {', '.join(self._arrays[path])}"
         else:
             table = self._tables[path]
+            table.numbers(_named(signal, table.names)[0])  # a text is the reason
             having = f"its columns: {', '.join(table.names) or f'0 to {len(table) - 1}'}"
         more = " or, of an arm that tells none, its commands, cmd=..." if signal == "tau" else ""
         raise DriverError(
@@ -286,7 +287,7 @@ class SourceReader:
 
     def _usual(self, table: SourceTable, signal: str) -> list[int]:
         """Places of the columns whose header names a signal."""
-        places, known = table.found(_LEROBOT.get(signal, "")), True
+        places, known = table.found(_LEROBOT[signal]) if signal in _LEROBOT else [], True
         if not places:
             places, known = _named(signal, table.names)
         places = [i for i in places if not table.is_text(i)][: 1 if signal == "time" else None]

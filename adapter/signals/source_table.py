@@ -26,7 +26,8 @@ from drivers.interface import Array, DriverError
 _SEPARATORS = (";", "\t", "|", ",")
 _GZIP = b"\x1f\x8b"
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
-_UNIT = re.compile(r"\s*[\[(]\s*([^\d\])][^\])]*)[\])]\s*$")  # of a header: pos [deg], not q[0]
+# of a header: pos [deg] or time_ms, not q[0]
+_UNIT = re.compile(r"\s*[\[(]\s*([^\d\])][^\])]*)[\])]\s*$|_(ms|us|ns|deg|rad|mNm|Nm)$")
 _INDEX = re.compile(r"\d+")
 _RANGE = re.compile(r"(\d*):(\d*)")
 
@@ -151,7 +152,7 @@ def read_table(path: Path) -> SourceTable:
         names = _split(comments[-1].lstrip("# "), separator)
     if not lines:
         raise DriverError(f"{path}: holds a header ({', '.join(names)}) and no numbers")
-    units = [match[1].strip() if (match := _UNIT.search(name)) else "" for name in names]
+    units = [(x[1] or x[2]).strip() if (x := _UNIT.search(name)) else "" for name in names]
     if names and len(lines) > 1 and not any(_numeric(lines[0][1], separator)):
         below = [word.strip("[]() ") for word in _split(lines.pop(0)[1], separator)]
         units = below if len(below) == len(names) else units

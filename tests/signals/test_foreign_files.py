@@ -86,6 +86,15 @@ TEXTS = {  # name: (content, expected words, options)
         text(np.hstack([TABLE, TABLE[:, 1:4]]), names=(*FRANKA, "q_d[0]", "q_d[1]", "tau_error")),
         READ,
     ),
+    "index of pandas.csv": (
+        text(np.hstack([TABLE[:, :1], TABLE]), names=("", *NAMES)).replace(",t,", ",time_s,"),
+        READ,
+    ),
+    "dates.csv": (
+        text().replace("\n", "\n2026-01-02 10:20:").rsplit("\n", 1)[0],
+        "line 2, column 0 \\(t\\): '2026-01-02 10:20:0' is not",
+    ),
+    "milliseconds told.csv": (scaled([0], 1e3).replace("t,", "time_ms,", 1), READ),
     "stamps in ns untold.csv": (text(STAMPS * [1e9, 1, 1, 1, 1, 1, 1]), "line 2: .* is no time"),
     "degrees.csv": (scaled([1, 2, 3, 4], 180 / np.pi), READ, "--units", "q=deg"),
     "degrees untold.csv": (scaled([1, 2, 3, 4], 57.3), "are they degrees\\? Say --units q=deg"),
