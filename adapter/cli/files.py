@@ -81,9 +81,8 @@ def run_info(args: argparse.Namespace) -> int:
         log = opened(args)
         facts = describe(args.file if log is None else log, args.topic)
         lines = summary(facts)
-        if args.robot is not None and facts.get("tracking_error_rad"):
-            lines.append(f"can be learned from: adapter gap {args.file} --model {args.robot}")
-        elif args.robot is not None and facts["problem"] is None:
+        teaching = facts["problem"] is None and facts["tracking_error_rad"] is None
+        if args.robot is not None and teaching:
             # What predicts brings torch, which the rest of this file can do without.
             predict = import_module("adapter.cli.teachable").predict
             facts["teachable"], more = predict(args, log)

@@ -129,10 +129,9 @@ def assembled(
         names = order if isinstance(order, list) else []
         links = assemble_links(topics, names, carrier, sensors)
         found = frame_motions(topics, tell, scan.path, warnings)
-    commands, ordered = None, topics.get(JOINT_COMMANDS)
-    # positions commanded to an arm that tells efforts are of no use beside these
-    if ordered is not None and ordered.count and (asked or not fits(ordered, effort=False)):
-        check_type(ordered, scan.path)
+    commands = None
+    if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
+        check_type(topics[JOINT_COMMANDS], scan.path)
         where = f"{scan.path}: {JOINT_COMMANDS}"
         commands = commands_told(asked, where, rows.names, mapped, warnings)
     log = Log(
