@@ -58,7 +58,7 @@ class ImportSpec:
         sources: a file for each signal (time, q, dq, tau, and cmd: commanded positions), "" for
             those without their own. Text tables (packed by gzip or not), .npz, .parquet, the
             folder of a LeRobot data set, or one of SAGE with its `control.csv`.
-        columns: selectors of each signal in its file (`SourceTable.columns`), or the key
+        columns: selectors of each signal in its file (`SourceTable.places`), or the key
             in an .npz. Where absent: the usual names, or the whole of a signal's own file.
         units: time s, ms, us, ns; q rad, deg; dq (per second) and cmd likewise, that of q where
             absent; tau Nm, mNm.
@@ -275,7 +275,7 @@ class SourceReader:
             places = table.places(self._spec.columns[signal], signal)
         else:
             places = self._usual(table, signal)
-            if not places and self._spec.sources.get(signal) == path:
+            if not places and Path(self._spec.sources.get(signal, "")) == path:
                 times = self._usual(table, "time") if len(table) > 1 else []
                 rest = [i for i in range(len(table)) if i not in times]
                 places = [i for i in rest if not table.is_text(i)] or rest
