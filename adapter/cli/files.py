@@ -16,8 +16,9 @@ from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.runs.terminal import show, warn, write_json
-from adapter.signals.importer import ImportSpec, import_file, recording_log, table_log
+from adapter.signals.importer import import_file, is_data_set, recording_log, table_log
 from adapter.signals.recording import describe, summary
+from adapter.signals.source_signals import ImportSpec
 from drivers.files.mcap import Log, recover
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
@@ -30,6 +31,7 @@ def run_import(args: argparse.Namespace) -> int:
         args.sources,
         args.columns,
         args.units,
+        args.names,
         joint_names=joints,
         flat=args.flat,
         period_s=args.period,
@@ -79,7 +81,8 @@ def run_info(args: argparse.Namespace) -> int:
         log = opened(args)
         facts = describe(args.file if log is None else log, args.topic)
         lines = summary(facts)
-        if args.robot is not None and facts["problem"] is None:
+        teaching = facts["problem"] is None and facts["tracking_error_rad"] is None
+        if args.robot is not None and teaching:
             # What predicts brings torch, which the rest of this file can do without.
             predict = import_module("adapter.cli.teachable").predict
             facts["teachable"], more = predict(args, log)
@@ -95,7 +98,7 @@ def opened(args: argparse.Namespace) -> Log | None:
     path = args.file
     table = path.with_suffix("") if path.suffix == ".gz" else path
     more = {"period_s": args.period, "episode": args.episode}
-    if table.suffix in TABLES or (path / "meta" / "info.json").is_file():
+    if table.suffix in TABLES or is_data_set(path):
         return table_log(ImportSpec.from_options([str(path)], args.columns, args.units, **more))
     if not (args.units or args.columns or any(x is not None for x in more.values())):
         return None

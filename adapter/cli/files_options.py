@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 
 from adapter.cli import options
@@ -13,8 +14,9 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Turn tables (CSV, white space, either packed by gzip, .npz, .parquet, or the folder of a "
-        "LeRobot data set) or a bag (rosbag2, ROS 1, MCAP) into an MCAP recording of our own. "
-        "Sources are one FILE, or of tables SIGNAL=FILE for each of time, q, dq, tau."
+        "LeRobot data set or of SAGE) or a bag (rosbag2, ROS 1, MCAP) into an MCAP recording of "
+        "our own. Sources are one FILE, or of tables SIGNAL=FILE for each of time, q, dq, tau, "
+        "cmd (commanded positions)."
     )
     add = parser.add_argument
     add("sources", nargs="+", metavar="[SIGNAL=]FILE")
@@ -29,6 +31,8 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
         metavar="LIST",
         help="joint names, commas between",
     )
+    said = "joints that are called otherwise: A in the source, B here; LEFT_*=* takes off a prefix"
+    add("--names", type=options.names_in, default=(), metavar="A=B,...", help=said)
     add("--flat", action="store_true", help="one value per line")
     add("--overwrite", action="store_true", help="replace an existing recording")
     options.add_json(parser)
@@ -41,7 +45,16 @@ def _add_tables(parser: argparse.ArgumentParser) -> None:
     add("--columns", default="", metavar="MAP", help="as in time=0,q=1:8,dq=8:15,tau=tau_*")
     add("--units", default="", metavar="MAP", help="as in q=deg,tau=mNm,time=ms")
     add("--period", type=float, metavar="S", help="where there is no time")
+    add("--rate", dest="period", type=_period_of, metavar="HZ", help="the same")
     add("--episode", type=int, metavar="N", help="of a LeRobot data set with several")
+
+
+def _period_of(text: str) -> float:
+    """The period of a rate. Raises ArgumentTypeError."""
+    with suppress(ValueError):
+        if float(text) > 0.0:
+            return 1.0 / float(text)
+    raise argparse.ArgumentTypeError(f"'{text}' is no rate in Hz")
 
 
 def _check_import(args: argparse.Namespace) -> None:
@@ -87,10 +100,11 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Write a model as URDF or MJCF. Onto the robot's file (INPUT, or by default the one that "
         "the model came from) only what was learned is written: inertials, places of joints, "
-        "friction; every other byte stays as it is."
+        "friction; every other byte stays as it is. Or write a recording as a data set of LeRobot."
     )
     add = parser.add_argument
-    add("model", type=Path, metavar="MODEL", help="model file (.json)")
+    add("model", type=Path, metavar="MODEL|LOG", help="model file (.json), or a recording")
+    add("--lerobot", type=Path, metavar="FOLDER", help="of LOG: a data set, version 3, to write")
     add("--urdf", type=Path, metavar="FILE", help="to write")
     add("--mjcf", type=Path, metavar="FILE", help="to write")
     onto = parser.add_mutually_exclusive_group()
@@ -107,6 +121,10 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_export(args: argparse.Namespace) -> None:
+    if args.lerobot is not None:
+        if args.urdf or args.mjcf or args.onto or args.alone:
+            raise UsageError("--lerobot is for a recording and goes with no other file")
+        return
     if args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:

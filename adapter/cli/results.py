@@ -30,6 +30,7 @@ from adapter.runs.run_folder import RunData, load_run, run_data, save_run
 from adapter.runs.score import Reference, counted_from
 from adapter.runs.terminal import json_ready, output, program_version, show, warn, write_json
 from adapter.signals.front_end import FrontEnd
+from adapter.signals.lerobot import write_lerobot
 
 
 class Learned(NamedTuple):
@@ -183,6 +184,11 @@ def write_robot(path: Path, written: RobotText) -> None:
 
 def run_export(args: argparse.Namespace) -> int:
     """Carry `export` out."""
+    if args.lerobot is not None:
+        warn(write_lerobot(args.model, args.lerobot))
+        write_json(args.json, {"lerobot": str(args.lerobot)})
+        show(str(args.lerobot))
+        return 0
     model = check_effects(load_model(args.model), args.model)
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):

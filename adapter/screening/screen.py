@@ -30,7 +30,7 @@ from adapter.screening.timing import (
     unsaid,
     unwrapped,
 )
-from adapter.signals.matching import matching, most_moved
+from adapter.signals.matching import matching, most_moved, several
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.told import told_of
 from adapter.signals.validation import GRID_S, smooth
@@ -263,6 +263,8 @@ def of_this_robot(log: Log, model: SelfModel) -> Log:
     try:
         return matching(log, model)
     except DriverError:
+        if arms := several(model.tree.joint_names, log):
+            raise RecordingRefused(RecordingFault.ROBOT, arms) from None
         missing = [name for name in model.tree.joint_names if name not in log.joint_names]
         raise _another_robot(
             log, model, log.joint_names, f"it lacks {', '.join(missing)}"

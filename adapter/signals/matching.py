@@ -77,6 +77,8 @@ def matching(log: Log, documented: SelfModel) -> Log:
     joints, warnings = corresponding(tree.joint_names, log.joint_names, "joint")
     missing = [name for name, found in zip(tree.joint_names, joints, strict=True) if found is None]
     if missing:
+        if arms := several(tree.joint_names, log):
+            raise DriverError(arms)
         raise DriverError(
             f"{log.path}: has no joint {', '.join(missing)}; it has {', '.join(log.joint_names)}; "
             f"{documented.name} has {', '.join(tree.joint_names)}"
@@ -106,11 +108,11 @@ def corresponding(
     """For each wanted name the one in `have` (None: not there), and warnings."""
     if all(name in have for name in want):
         return list(want), []
-    ends = [tuple(f"{mark}{name}" for mark in "/:.") for name in want]
-    spaced = [[x for x in have if x.endswith(end)] for end in ends]
-    if all(len(x) == 1 for x in spaced):  # of a namespace, beside joints of other things
-        said = f"{what} names are taken without what stands before them: "
-        return [x[0] for x in spaced], [said + ", ".join(x[0] for x in spaced)]
+    starts = prefixes(want, have)
+    if len(starts) == 1:  # of a namespace, beside joints of other things
+        return [f"{starts[0]}{name}" for name in want], [
+            f"{what} names are taken without the {starts[0]} before them"
+        ]
     if len(have) != len(want):
         return [name if name in have else None for name in want], []
     number = {_number(name): name for name in have}
@@ -119,6 +121,23 @@ def corresponding(
         return [name if name in have else None for name in want], []
     pairs = ", ".join(f"{a} = {b}" for a, b in zip(found, want, strict=True))
     return found, [f"{what} names differ and are matched by their numbers: {pairs}"]
+
+
+def prefixes(want: Sequence[str], have: Sequence[str]) -> list[str]:
+    """What stands before all the wanted names in `have`: `left/` and `right_`, of several arms."""
+    each = [{x.removesuffix(name) for x in have if x.endswith(name)} for name in want]
+    return sorted(x for x in set.intersection(*each) if x.endswith(tuple("/:._"))) if each else []
+
+
+def several(want: Sequence[str], log: Log) -> str:
+    """A sentence on a recording of several arms with these joints, "" of any other."""
+    arms = prefixes(want, log.joint_names)
+    if len(arms) < 2:
+        return ""
+    return (
+        f"{log.path}: has {len(arms)} such arms, {' and '.join(arms)}; take one: "
+        f"adapter import {log.path} --names '{arms[0]}*=*' --to FILE"
+    )
 
 
 def _number(name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from drivers.files.mcap import (
     derive_velocity,
     looks_like_degrees,
     read_log,
+    read_position_log,
     sample_log,
     survey,
 )
@@ -34,7 +36,8 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     that tell the motion of others), samples, samples_judged (of a long recording content is
     judged from a sample, and a warning says so), start_s, duration_s,
     rate_hz, period_ms, jitter_ms, repeated_samples, repeated_stamps, backward_steps, not_finite,
-    gaps, range, metadata, attachments.
+    gaps, range, metadata, attachments; commands (how many), commanded (positions or torques);
+    tracking_error_rad, rms of command less position of each joint where there are no efforts.
 
     Raises:
         DriverError: the file is unreadable, empty or not MCAP.
@@ -80,7 +83,7 @@ def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
     sample = sample_log(path, topic, "frames") if log is None else None
     holes: list[tuple[float, float]] = []
     if sample is None:
-        log = read_log(path, topic=topic, beside="frames") if log is None else log
+        log = _read(path, topic) if log is None else log
         parts, samples, part = log.spread(), len(log), log.is_mapped
         commands = 0 if log.commands is None else len(log.commands.stamp_ns)
     else:
@@ -94,6 +97,35 @@ def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
         "and duration are of the whole"
     )
     return _Looked(parts, samples, commands, [*log.warnings, *([judged] if part else [])], holes)
+
+
+def _read(path: Path, topic: str | None) -> Log:
+    """A recording, also one of commanded and measured positions alone. Raises DriverError."""
+    log, trouble = None, None
+    try:
+        log = read_log(path, topic=topic, beside="frames")
+    except DriverError as error:
+        trouble = error
+    if log is None or not (log.is_mapped or np.any(np.nan_to_num(log.tau))):
+        with suppress(DriverError):  # the first one says what is wrong
+            log = read_position_log(path, topic) or log
+    if log is None:
+        assert trouble is not None
+        raise trouble
+    return log
+
+
+def _of_servos(log: Log) -> bool:
+    """Whether it tells positions and commanded ones, and no efforts."""
+    return log.commands is not None and log.commands.q is not None and bool(np.isnan(log.tau).all())
+
+
+def _tracking_error(log: Log) -> list[float]:
+    """Rms of command less position of each joint, rad; a command holds until the next."""
+    assert log.commands is not None and log.commands.q is not None
+    at = np.searchsorted(log.commands.stamp_ns, log.stamp_ns, side="right") - 1
+    error = log.commands.q[at[at >= 0]] - log.q[at >= 0]
+    return np.sqrt(np.mean(error**2, axis=0)).tolist() if len(error) else []
 
 
 def summary(facts: dict[str, Any]) -> list[str]:
@@ -122,7 +154,8 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
             f"{period['max']:.3g})"
         )
     )
-    others = [f"{facts['commands']} commanded torques"] if facts["commands"] else []
+    others = [f"{facts['commands']} commanded {facts['commanded']}"] if facts["commands"] else []
+    off = [f"{1e3 * x:.3g}" for x in facts["tracking_error_rad"] or ()]
     others += [f"motion of {name}" for name in (*facts["links"], *facts["frames"])]
     return [
         f"joints: {count}, {', '.join(facts['joints'])}",
@@ -137,6 +170,7 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
             f"{name}: {'  '.join(map('{:.3g}..{:.3g}'.format, found['min'], found['max']))}"
             for name, found in facts["range"].items()
         ),
+        *([f"command less position, rms: {'  '.join(off)} mrad"] if off else []),
         f"units: {facts['units']}",
         f"can teach: {facts['teaches']}",
     ]
@@ -149,6 +183,8 @@ def _units(parts: list[Log], q: Array, dq: Array, tau: Array) -> str:
         slope = np.abs(np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts]))
         fast = slope > _FAST
         ratio = float(np.median((np.abs(dq) / slope)[fast])) if fast.any() else np.nan
+    if _of_servos(parts[0]):
+        return f"{said[0]}, no efforts"
     if not np.isfinite(ratio):
         said.append("velocities cannot be judged")
     elif _PLAUSIBLE < ratio < 1.0 / _PLAUSIBLE:
@@ -168,6 +204,12 @@ def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
     said = [f"{seconds:.3g} s of motion"]
     if resting:
         said.append(f"at rest: {', '.join(resting)}")
+    if _of_servos(log):
+        said.append(
+            "no torques: the servos and no inertias; `adapter gap LOG --model ROBOT` finds gain, "
+            "delay and friction of each joint that moves"
+        )
+        return "; ".join(said)
     if not np.any(np.nan_to_num(tau)):
         said.append("no torques: nothing of inertias and friction")
     if log.twists is None and not log.frames:
@@ -180,9 +222,14 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
     tables = (np.concatenate([getattr(x, key) for x in parts]) for key in ("q", "dq", "tau"))
     signals = dict(zip(("q_rad", "dq_rad_s", "tau_nm"), tables, strict=True))
     q, dq, tau = signals.values()
+    judged = ["q", "dq", "tau"]
+    if of_servos := _of_servos(log):
+        signals, judged = {"q_rad": q}, ["q"]
+        dq = np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts])
     repeated = 0
     for part in parts:
-        same = [(x[1:] == x[:-1]).all(axis=1) for x in (part.q, part.dq, part.tau)]
+        tables = (getattr(part, key) for key in judged)
+        same = [(x[1:] == x[:-1]).all(axis=1) for x in tables]
         repeated += int(np.all(same, axis=0).sum())
     finite = np.all([np.isfinite(v).all(axis=1) for v in signals.values()], axis=0)
     return {
@@ -195,6 +242,8 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
         "samples": looked.samples,
         "samples_judged": sum(map(len, parts)),
         "commands": looked.commands,
+        "commanded": "positions" if log.commands and log.commands.q is not None else "torques",
+        "tracking_error_rad": _tracking_error(log) if of_servos else None,
         "repeated_samples": repeated,
         "not_finite": int((~finite).sum()),
         "range": {

@@ -101,6 +101,9 @@ def test_your_own_log(toured: Path) -> None:
     seconds = 1e-9 * log.stamp_ns[:, None]
     table = np.hstack([seconds, np.degrees(log.q), np.degrees(log.dq), log.tau])
     np.savetxt(toured / "log.csv", table, delimiter=",")
+    for name in ("states", "commands"):  # of a servo that follows at once
+        head = ",".join(["time", *(f"q_{k}" for k in range(7))])
+        np.savetxt(toured / f"{name}.csv", table[:, :8], delimiter=",", header=head)
     shutil.copy(toured / "panda_learned.urdf", toured / "my_arm.urdf")
     assert len(OWN_LOG) >= 3
     for line in OWN_LOG:

@@ -14,8 +14,9 @@ from adapter.errors import SettingsError
 from adapter.gap.torque_gains import as_told, learn_gains
 from adapter.model.self_model import SelfModel
 from adapter.screening.screen import RecordingRefused, check_torque, refuse
-from adapter.signals.importer import ImportSpec, table_log
+from adapter.signals.importer import table_log
 from adapter.signals.matching import matching
+from adapter.signals.source_signals import ImportSpec
 from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log, write_log
 from tests.benchmarks.lambda_trials import robots_folder

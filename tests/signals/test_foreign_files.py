@@ -44,6 +44,7 @@ def scaled(columns, factor):
     return text(table)
 
 
+FRANKA = ("time", "q[0]", "q[1]", "dq[0]", "dq[1]", "tau_J[0]", "tau_J[1]")
 STAMPS = TABLE.copy()
 STAMPS[:, 0] += 1.7e9
 TEXTS = {  # name: (content, expected words, options)
@@ -81,6 +82,19 @@ TEXTS = {  # name: (content, expected words, options)
     "ten seconds apart.csv": (scaled([0], 1e3), READ, "--units", "time=s"),
     "nanoseconds untold.csv": (scaled([0], 1e9), "is the time in s\\?|is no time"),
     "stamps.csv": (text(STAMPS), READ),
+    "others beside.csv": (
+        text(np.hstack([TABLE, TABLE[:, 1:4]]), names=(*FRANKA, "q_d[0]", "q_d[1]", "tau_error")),
+        READ,
+    ),
+    "index of pandas.csv": (
+        text(np.hstack([TABLE[:, :1], TABLE]), names=("", *NAMES)).replace(",t,", ",time_s,"),
+        READ,
+    ),
+    "dates.csv": (
+        text().replace("\n", "\n2026-01-02 10:20:").rsplit("\n", 1)[0],
+        "line 2, column 0 \\(t\\): '2026-01-02 10:20:0' is not",
+    ),
+    "milliseconds told.csv": (scaled([0], 1e3).replace("t,", "time_ms,", 1), READ),
     "stamps in ns untold.csv": (text(STAMPS * [1e9, 1, 1, 1, 1, 1, 1]), "line 2: .* is no time"),
     "degrees.csv": (scaled([1, 2, 3, 4], 180 / np.pi), READ, "--units", "q=deg"),
     "degrees untold.csv": (scaled([1, 2, 3, 4], 57.3), "are they degrees\\? Say --units q=deg"),

@@ -143,7 +143,7 @@ def test_what_goes_with_tables_only_is_refused(tmp_path, capsys):
         assert said in refused(capsys, bag, *options)
     out = str(tmp_path / "none.mcap")
     assert main(["import", f"q={bag}", "--to", out]) == ExitCode.WRONG_USE
-    assert "is a recording with all signals; write it without q=" in capsys.readouterr().err
+    assert "is a recording with all signals; write it without SIGNAL=" in capsys.readouterr().err
     assert main(["import", str(bag), str(bag), "--to", out]) == ExitCode.WRONG_USE
     assert "are both for all signals" in capsys.readouterr().err
     table = tmp_path / "a.csv"

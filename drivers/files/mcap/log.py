@@ -264,12 +264,14 @@ def write_log(log: Log, path: Path, metadata: Mapping[str, Any]) -> None:
         metadata = {**metadata, "link_names": []}
     with McapWriter(path, log.joint_names, links, metadata, overwrite=True) as writer:
         orders = log.commands
-        if orders is not None and orders.q is not None:
-            for stamp_ns, q in zip(log.stamp_ns.tolist(), log.q, strict=True):
-                writer.write_position(stamp_ns, q)
-            for stamp_ns, q in zip(orders.stamp_ns.tolist(), orders.q, strict=True):
+        positions = orders.q if orders is not None else None
+        if orders is not None and positions is not None:
+            for stamp_ns, q in zip(orders.stamp_ns.tolist(), positions, strict=True):
                 writer.write_position_command(stamp_ns, q)
-            return
+            if np.isnan(log.tau).all():
+                for stamp_ns, q in zip(log.stamp_ns.tolist(), log.q, strict=True):
+                    writer.write_position(stamp_ns, q)
+                return
         for i, stamp_ns in enumerate(log.stamp_ns.tolist()):
             writer.write_joint_state(stamp_ns, log.q[i], log.dq[i], log.tau[i])
             if not links:
@@ -277,7 +279,7 @@ def write_log(log: Log, path: Path, metadata: Mapping[str, Any]) -> None:
             assert log.twists is not None and log.accels is not None
             if not np.isnan(log.twists[i]).all() or not np.isnan(log.accels[i]).all():
                 writer.write_links(stamp_ns, LinkMotion(log.twists[i], log.accels[i]))
-        if orders is not None:
+        if orders is not None and positions is None:
             for stamp_ns, tau in zip(orders.stamp_ns.tolist(), orders.tau, strict=True):
                 writer.write_command(stamp_ns, tau)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -186,8 +185,20 @@ def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
     _, when, commands, _ = _positions(commanded, scan.path, names)
     nothing, warnings = np.full_like(rows, np.nan), scan.warnings + said
     orders = Commands(when, np.full_like(commands, np.nan), commands)
-    log = Log(scan.path, names, at, rows, nothing, nothing, topic=states, warnings=warnings)
-    return replace(log, commands=orders)
+    return Log(
+        scan.path,
+        names,
+        at,
+        rows,
+        nothing,
+        nothing,
+        commands=orders,
+        metadata=_decoded_metadata(scan),
+        topics=_topics_told(topics),
+        topic=states,
+        truncated=scan.truncated,
+        warnings=warnings,
+    )
 
 
 def _positions(

@@ -1,0 +1,188 @@
+"""Files of position-controlled arms, and tables as spreadsheets and loggers write them."""
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+
+from adapter.cli import main
+from adapter.cli.exit_codes import ExitCode
+from drivers.files.mcap import McapWriter, read_log, read_position_log
+from tests.helpers.bags import Motion, write_ros2
+
+TIME = np.arange(500) * 0.02
+Q = 0.5 * np.sin(2.0 * TIME[:, None] + [0.0, 1.0])
+CMD = np.add(Q, [0.03, -0.05])
+TAU = np.cos(3.0 * TIME[:, None] + [0.0, 1.0])
+
+
+def table(path, *columns, header="", point=".", code="utf-8"):
+    rows = [";".join(map(str, row)) for row in np.column_stack(columns).tolist()]
+    path.write_bytes("\n".join([header, *rows]).replace(".", point).encode(code))
+    return path
+
+
+def imported(tmp_path, *words):
+    """The recording that a command line makes."""
+    out = tmp_path / "out.mcap"
+    assert main(["import", *map(str, words), "--to", str(out), "--overwrite"]) == 0
+    return read_position_log(out) or read_log(out)
+
+
+def refusal(capsys, *words):
+    """The last line of what a command line is refused with."""
+    assert main(["import", *map(str, words), "--to", "none.mcap"]) == ExitCode.WRONG_USE
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def assert_commanded(log, q=Q, commands=CMD, stamps_s=TIME):
+    assert np.isnan(log.tau).all() and log.commands is not None
+    assert np.allclose(log.q, q) and np.allclose(log.commands.q, commands)
+    assert np.allclose(log.commands.stamp_ns, np.round(stamps_s * 1e9), rtol=0, atol=500)
+
+
+@pytest.mark.parametrize("names", ["q_cmd", "command_", "target", "desired.", "Soll pos "])
+def test_commands_have_usual_names(tmp_path, names):
+    header = f"t;q_1;q_2;{names}1;{names}2"
+    assert_commanded(imported(tmp_path, table(tmp_path / "a.csv", TIME, Q, CMD, header=header)))
+
+
+def test_torques_beside_commands_are_kept_where_they_are_asked_for(tmp_path, capsys):
+    header, signals = "t;q_1;q_2;tau_1;tau_2;", (TIME, np.degrees(Q), TAU, np.degrees(CMD))
+    for names, first in (("c1;c2", ("--columns", "cmd=c1,c2")), ("cmd_1;cmd_2", ())):
+        path = table(tmp_path / "a.csv", *signals, header=header + names)
+        words = [path, "--units", "q=deg"]
+        logs = [imported(tmp_path, *words, *first)]
+        columns = capsys.readouterr().err.split("--columns ")[1].split(")")[0]
+        columns = ",".join([*first[1:], columns])  # as the report says
+        logs.append(imported(tmp_path, *words, "--columns", columns))
+        with_torques, without = logs if not first else logs[::-1]
+        assert_commanded(without)
+        assert np.allclose(with_torques.tau, TAU) and np.allclose(with_torques.q, Q)
+        assert with_torques.topics["/joint_commands"].messages == len(TIME)
+        capsys.readouterr()
+
+
+def test_commands_keep_their_own_clock(tmp_path, capsys):
+    when = 0.003 + TIME[::5]
+    states = table(tmp_path / "s.csv", TIME, Q, header="t;q_1;q_2")
+    orders = table(tmp_path / "c.csv", when, CMD[::5], header="time;a;b")
+    assert_commanded(imported(tmp_path, states, f"cmd={orders}"), Q, CMD[::5], when)
+    table(orders, when + 1e9, CMD[::5], header="time;a;b")
+    assert "are both on one clock" in refusal(capsys, states, f"cmd={orders}")
+    some = [f"{a};{b}" if k % 5 == 0 else ";" for k, (a, b) in enumerate(CMD)]
+    blank = table(tmp_path / "blank.csv", TIME, Q, some, header="t;q_1;q_2;cmd_1;cmd_2")
+    assert_commanded(imported(tmp_path, blank), Q, CMD[::5], TIME[::5])
+
+
+def test_a_data_set_there_and_back(tmp_path, capsys):
+    pq = pytest.importorskip("pyarrow.parquet")
+    states = table(tmp_path / "s.csv", 7.0 + TIME, Q, CMD, header="t;q_1;q_2;cmd_1;cmd_2")
+    imported(tmp_path, states, "--joints", "shoulder,elbow")
+    for name in ("one", "two"):
+        out = ["--lerobot", str(tmp_path / name)]
+        assert main(["export", str(tmp_path / "out.mcap"), *out]) == 0
+        log = imported(tmp_path, tmp_path / name)
+        assert_commanded(log)
+        assert log.joint_names == ("shoulder", "elbow")
+    first, second = (pq.read_table(tmp_path / x / "data") for x in ("one", "two"))
+    assert first.equals(second)
+    assert "warning" not in capsys.readouterr().err
+    turned = imported(tmp_path, tmp_path / "one", "--joints", "elbow,shoulder")
+    assert_commanded(turned, Q[:, ::-1], CMD[:, ::-1])
+    info = json.loads((tmp_path / "one" / "meta" / "info.json").read_text())
+    assert (info["fps"], info["total_frames"]) == (50, len(TIME))
+    assert set(info["features"]) == set(first.column_names)
+    assert main(["export", str(tmp_path / "out.mcap"), *out]) == ExitCode.WRONG_USE
+
+
+def sage(folder, joints):
+    folder.mkdir()
+    (folder / "joint_list.txt").write_text(f"{joints}\n")
+    heads = {"control.csv": "positions", "state_motor.csv.gz": "positions,velocities,torques"}
+    for (name, head), signals in zip(heads.items(), ([CMD], [Q, 0 * Q, TAU]), strict=True):
+        rows = [",".join(f'"{x[i].tolist()}"' for x in signals) for i in range(len(TIME))]
+        rows = [f"KIND,{1e6 * t},{row}" for t, row in zip(TIME.tolist(), rows, strict=True)]
+        content = "\n".join([f"type,timestamp,{head}", *rows]).encode()
+        (folder / name).write_bytes(gzip.compress(content) if name.endswith("gz") else content)
+    return folder
+
+
+def test_a_folder_of_sage_and_what_is_said_of_it(tmp_path, capsys):
+    folder = sage(tmp_path / "m", "Pitch\nJaw")
+    log = imported(tmp_path, folder, "--joints", "a,b")
+    assert_commanded(log)
+    said = capsys.readouterr().err
+    assert log.joint_names == ("a", "b") and "by their order: Pitch = a, Jaw = b" in said
+    assert "with torques: --columns tau=torques)" in said
+    assert np.allclose(imported(tmp_path, folder, "--columns", "tau=torques").tau, TAU)
+    imported(tmp_path, folder)
+    for told in (folder, tmp_path / "out.mcap"):
+        assert main(["info", str(told), "--robot", "panda"]) == 0
+        said = capsys.readouterr().out
+        for words in ("500 commanded positions", "rms: 30  50 mrad", "no efforts", "the servos"):
+            assert words in said
+        assert "problem" not in said and "adapter gap LOG --model" in said
+
+
+def test_efforts_of_zero_are_none(tmp_path, capsys):
+    with McapWriter(tmp_path / "a.mcap", ("a", "b")) as writer:
+        for k in range(len(TIME)):
+            writer.write_joint_state(k * 20_000_000, Q[k], 0 * Q[k], 0 * Q[k])
+            writer.write_position_command(k * 20_000_000, CMD[k])
+    assert main(["info", str(tmp_path / "a.mcap")]) == 0
+    assert "rms: 30  50 mrad" in capsys.readouterr().out
+
+
+def test_names_of_joints(tmp_path, capsys):
+    arm, folder = ("--joints", "lower_arm,upper_arm"), sage(tmp_path / "m", "Lower\nUpper")
+    assert imported(tmp_path, folder, *arm).joint_names == ("lower_arm", "upper_arm")
+    turned = sage(tmp_path / "n", "Upper\nLower")
+    assert "--names A=B" in refusal(capsys, turned, *arm)
+    log = imported(tmp_path, turned, *arm, "--names", "Upper=upper_arm,Lower=lower_arm")
+    assert_commanded(log, Q[:, ::-1], CMD[:, ::-1])
+    assert "no joint Uper" in refusal(capsys, turned, "--names", "Uper=a")
+    assert "calls two" in refusal(capsys, turned, "--names", "Upper=Lower")
+    assert "is not SOURCE=NAME" in refusal(capsys, turned, "--names", "Upper")
+
+
+def test_one_of_two_arms(tmp_path, capsys):
+    joints, arm = ("l_arm2", "l_arm1", "r_arm2", "r_arm1"), ("--joints", "arm1,arm2")
+    motion = Motion.of(4, samples=40)
+    topics = {"/joint_states": ("sensor_msgs/msg/JointState", motion)}
+    bag = write_ros2(tmp_path / "bag", topics, joints)
+    assert "has 2 such arms, l_ and r_; take one:" in refusal(capsys, bag, *arm)
+    log = imported(tmp_path, bag, *arm, "--names", "r_*=*")
+    assert np.array_equal(log.q, motion.q[:, [3, 2]])
+    one = write_ros2(tmp_path / "one", topics, (*joints[:2], "l_finger", "l_hand"))
+    assert np.array_equal(imported(tmp_path, one, *arm).q, motion.q[:, [1, 0]])
+    assert "taken without the l_ before them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("code", ["utf-16", "utf-8", "latin-1"])
+@pytest.mark.parametrize("point", [",", "."])
+def test_headers_that_say_their_units(tmp_path, code, point):
+    state, nothing = np.where(TIME > 1.0, "fährt", "steht"), np.full(len(TIME), "")
+    time, *signals = 1e3 * TIME, np.degrees(Q), 1e3 * TAU
+    german = "Zeit [ms];A1 pos [°];A2 pos [°];A1 torque [mNm];A2 torque [mNm];Zustand"
+    english = "angle 1;angle 2;x speed;Drehmoment 1;Drehmoment 2;time\ndeg;deg;;mNm;mNm;ms"
+    for header, columns in (
+        (german, (time, *signals, state)),
+        (english, (signals[0], nothing, signals[1], time)),
+    ):
+        path = table(tmp_path / "a.csv", *columns, header=header, point=point, code=code)
+        log = imported(tmp_path, path)
+        assert np.allclose(log.q, Q) and np.allclose(log.tau, TAU)
+        assert np.array_equal(log.stamp_ns, np.round(TIME * 1e9))
+
+
+def test_texts_and_blanks_that_nobody_asked_for(tmp_path, capsys):
+    words, where = np.full(len(TIME), "ok"), ("--columns", "q=1:3,tau=3:5")
+    path = table(tmp_path / "a.csv", words, Q, TAU, np.full(len(TIME), ""))
+    log = imported(tmp_path, path, *where, "--rate", "50")
+    assert np.array_equal(log.stamp_ns, np.round(TIME * 1e9))
+    assert "'ok' is not a number" in refusal(capsys, path, "--columns", "time=0,q=1:3")
+    with pytest.raises(SystemExit):
+        refusal(capsys, path, "--rate", "0")
+    assert "no rate in Hz" in capsys.readouterr().err
