@@ -257,7 +257,8 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
     fits = [fit_joint(task, ALL_FREE, first_guess(task)) for task in tasks]
     x = np.array([fit.x for fit in fits])
     left = np.sqrt([fit.error() / sum(map(np.sum, fit.task.rows)) for fit in fits])
-    if arm.ground.root == 0.0 and np.sum(left > NOISE_SHARE * noise) >= LEAST_JOINTS:
+    unexplained = np.sum(left > NOISE_SHARE * noise) >= LEAST_JOINTS
+    if unexplained and arm.ground.root == 0.0 and np.any(arm.rigid.gravity):
         ground, x = find_ground(arm.rigid, tasks, x)
         arm = replace(arm, ground=ground)
     tasks = arm.tasks([track.smooth for track in arm.tracks])

@@ -214,9 +214,7 @@ def find_ground(arm: RigidArm, tasks: Sequence[JointTask], x: Array) -> tuple[Gr
     if len(tasks[0].tracks) > 1:
         for each in _alone(tasks):
             starts.append(np.array([fit_joint(t, ALL_FREE, first_guess(t)).x for t in each]))
-    for link, beyond in product((arm.n - 1, arm.n - 2), BEYOND_M):
-        if link < 0:
-            continue
+    for link, beyond in product(range(max(arm.n - 2, 0), arm.n), BEYOND_M):
         one = _Together(arm, tasks, link)
         y, servos, cost = one.start(beyond), x, np.inf
         for _ in range(2):  # a joint that got stuck starts again, beside the ground as it is now
