@@ -42,8 +42,6 @@ from adapter.gap.signals import Signals, regressor_of
 from adapter.model.spatial import Array
 
 PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
-ALONE_NATS = 4.0  # signals of one bus are late together, not one joint's alone
-ALWAYS_NATS = 60.0  # what pushes for a whole recording is rather weight or a tilted base
 STEP = 0.02  # of a coefficient's typical size, for the differences
 
 
@@ -253,7 +251,6 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
 
 
 SLOW_PIECES = 10  # over time
-LEAST_RMS = 1e-6
 LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
 LINE_HZ = (0.15, 9.0)
 SHARPENED, FINE = 12, 40  # rounds in which a line's frequency is sharpened; steps either way
@@ -328,7 +325,7 @@ def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]
         tried = [low + share * (high - low) for share in setting.tried] if setting else [1.0]
         for template in map(law.at, tried):
             rms = np.sqrt(np.mean([_power(at, law, template, joint) for at in stages]))
-            std = CURVE_NM / max(float(rms), LEAST_RMS)
+            std = CURVE_NM / max(float(rms), 1e-6)
             scaled = (std,) * len(template.prior_std)
             out.append((law, joint, replace(template, prior_std=scaled)))
     return out
@@ -428,7 +425,7 @@ def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     """ln of what a candidate is worth before the data, the ways to look for it included."""
     odds = c.log_odds
     if c.effect.passing and not passing:
-        odds -= ALWAYS_NATS
+        odds -= 60.0  # what pushes for a whole recording is rather weight or a tilted base
     if timed or passing:
         odds += c.effect.log_odds_of_start
     return float(odds)
@@ -440,5 +437,5 @@ def prior_log_odds(effect: Effect, joint: int, n: int, ways: int) -> float:
     if joint >= 0:
         odds -= np.log(n)
         if effect.scope == ALL:
-            odds -= ALONE_NATS
+            odds -= 4.0  # signals of one bus are late together, not one joint's alone
     return float(odds)

@@ -23,15 +23,11 @@ from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
 
-OVERLAP = 0.9
 OFFSET, SPRING = "torque_offset", "joint_spring"
-MOST_RIVALS = 3
 SHOWN_CHI2 = 4.0  # of an offset: two standard deviations
 OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
-SINGLED_OUT = 0.9  # probability of a link's correction
 ODD = 4.0  # standard deviations from which on a correction is a finding
 DIFFERENCE = 1e-4  # of a coefficient's prior
-CURVE_POINTS = 41  # of a law over its signal
 DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
 SMOOTH, BEFORE = 3.5, 6  # level of a residual over what so many samples before do not foretell
@@ -94,7 +90,7 @@ def _curve(fit: Fit, covariance: Array, k: int) -> dict[str, Any] | None:
         return None
     joint, at = law.by - 1 if law.by else named.candidate.joint, fit.model.stages(0)
     seen = signal_of(law.along, at.links, at.rigid, joint)
-    x = np.linspace(seen.min(), seen.max(), CURVE_POINTS)
+    x = np.linspace(seen.min(), seen.max(), 41)  # of a law over its signal
     std = _std_of(lambda values: law.curve(x, values), fit, covariance, k)
     torque = law.curve(x, named.values)
     return {"over": f"{law.along}{joint + 1}", "at": x, "torque_nm": torque, "std_nm": std}
@@ -166,7 +162,7 @@ def corrected_links(found: Found, end_s: float, trusted: Array) -> list[Finding]
     if wrong > 1:  # one wrong link says nothing of the others, several: the whole model is poor
         odds = max(odds, float(np.log((wrong - 1) / len(odd))))
     told = [_wrong_link(fit, known, k, end_s, gain + odds) for k, gain in gains.items()]
-    return [f for f in told if f.evidence > SINGLED_OUT]
+    return [f for f in told if f.evidence > 0.9]  # probability of a link's correction
 
 
 def _gain_of_link(fit: Fit, known: Carried | Moments, k: int, trusted: Array) -> float:
@@ -291,12 +287,12 @@ def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, floa
         effect = rival.candidate.effect
         if isinstance(effect, Pattern) or effect.name == standing.candidate.effect.name:
             continue
-        if rival.overlap >= OVERLAP and _is_open(standing, rival, named, shifted):
+        if rival.overlap >= 0.9 and _is_open(standing, rival, named, shifted):
             best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
     # of rivals that explain all but the same, those that the data favour come first
     credible = {r.candidate.effect.name: -i for i, r in enumerate(standing.rivals[::-1])}
     order = sorted(best, key=lambda name: (-round(best[name], 2), credible.get(name, 0)))
-    return {name: best[name] for name in order[:MOST_RIVALS]}
+    return {name: best[name] for name in order[:3]}  # the likeliest
 
 
 def _is_open(standing: Standing, rival: Rival, named: Named, shifted: bool) -> bool:

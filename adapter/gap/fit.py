@@ -35,7 +35,6 @@ EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
-FAR_STEP = 3.0  # where others stay as they are
 HALVED = 7  # steps between two settings, each half of the one before
 WIDER = 2.0  # than what any arm has: what may have a name beside it
 MOST_FITTED = 0.5  # of independent rows that coefficients may have taken
@@ -560,7 +559,7 @@ def _reshaped(fit: Fit, place: int) -> Fit:
     """The same where its own columns are all that changes; others stay as linear as they are."""
     carried = fit.carried()
     best, named = carried, fit.named[place]
-    for step in (FAR_STEP, *SHAPE_STEPS):
+    for step in (3.0, *SHAPE_STEPS):  # where others stay as they are
         for other in _other_shapes(named, step):
             trial = _with_shape(fit, carried, place, other)
             if trial.g @ trial.x > best.g @ best.x:

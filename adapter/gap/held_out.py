@@ -33,11 +33,9 @@ from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
 from adapter.signals.validation import smooth
 from adapter.simulate import DrivenMotion, Simulate
 
-SEGMENT_S = 0.5
 SMEARED_MS = 101  # about an instant, in which the recipe's filter mixes torques
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
-THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
@@ -204,7 +202,7 @@ def rollout_errors(
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
     heard = np.logical_or(recording.heard_at(t).all(axis=1), drive == COMMANDS)
-    length = round(SEGMENT_S / ROLLOUT_STEP_S)
+    length = round(0.5 / ROLLOUT_STEP_S)  # half a second
     segments = [
         (a, b)  # the row at b is the next start
         for a, b in pairwise(range(0, len(t), length))
@@ -216,7 +214,7 @@ def rollout_errors(
     told = np.zeros(len(t), dtype=bool)
     for begin, end in segments:  # a simulation that was refused lacks even its start
         told[begin:end] = np.isfinite(old_q[begin]).all() and np.isfinite(new_q[begin]).all()
-    thin = slice(None, None, THINNED)
+    thin = slice(None, None, 10)  # rollout rows kept for a plot: one in so many
     curves = RolloutCurves(t[thin], q[thin], old_q[thin], new_q[thin])
     return RolloutErrors(
         _off(old_q, q)[told],

@@ -16,10 +16,8 @@ from adapter.gap.result import UNEXPLAINED
 from adapter.model.spatial import Array
 
 GROUPS = 10  # in the window, 0.2 s each
-THRESHOLD = 12.0  # log evidence of a report
 MARGIN = 3.0  # log evidence by which the best name leads when it is told at once
 NEW = 4.0  # log evidence for a start inside the window against one before it
-SOONEST_S = 0.7  # after its start: before, all names look alike
 LATEST_S = 1.4  # after its start the best name is told even if another is close
 OVER_THRESHOLD = 10.0
 OVER_SHARE = 0.7  # of the best new name's evidence, which has more freedom around the edge
@@ -29,7 +27,6 @@ EDGE_ROWS, HALF_ROW_S = 3, 0.02
 LEFT_RATIO, LEFT_SHARE = 4.0, 0.15  # of the level, of the residual: more is left unexplained
 POWER, POWER_OVER, POWER_S = 6.0, 2.0, 1.0  # times the level over a second: something, nothing
 POWER_ROWS = 25
-MOST = 6  # disagreements at a time
 
 
 class DisagreementDetector:
@@ -68,7 +65,7 @@ class DisagreementDetector:
                 ended = True
                 break
         ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
-        if not ended and ready and len(self._found.active) < MOST:
+        if not ended and ready and len(self._found.active) < 6:  # disagreements at a time
             self._report_something(evidence, scores, power)
         if ended or len(self._found.reports) > before:
             self._quiet_until_s, self._began_s = now_s + REST_S, np.inf
@@ -111,7 +108,7 @@ class DisagreementDetector:
         """Tell the best candidate if it leads, or that nothing explains what is new."""
         best = scores.max(axis=1)
         which = int(np.argmax(best))
-        if best[which] <= THRESHOLD:
+        if best[which] <= 12.0:  # log evidence of a report
             self._began_s = np.inf  # but that no candidate looks like may be there for a second
             known = {j for found in self._found.active for j in found.joints if found.lasts}
             loud = np.flatnonzero(power > POWER)
@@ -130,7 +127,7 @@ class DisagreementDetector:
         if self._now_s - self._began_s >= LATEST_S:  # the start may wander; then the first counts
             first = min(first, int(np.searchsorted(t, self._began_s)))
         age_s = self._now_s - float(t[first])
-        if age_s >= SOONEST_S:
+        if age_s >= 0.7:  # after its start: before, all names look alike
             self._name(evidence, first, float(np.sqrt(2.0 * best[which])), age_s < LATEST_S)
 
     def _name(self, evidence: Evidence, first: int, score: float, may_wait: bool) -> None:
@@ -171,7 +168,6 @@ class DisagreementDetector:
 
 SAME_S, WIDER = 0.5, 3.0  # of one thing that is larger than its prior: told since; times that prior
 EDGE_S = 0.1  # around starts and ends, where the filter is between two states
-MUTED = 1e-3  # weight of a joint with something unexplained
 
 
 @dataclass(eq=False)
@@ -294,7 +290,7 @@ class DisagreementList:
         weight = weight.copy()
         for found in self.active:
             if found.candidate is None:
-                weight[:, found.joints] *= MUTED
+                weight[:, found.joints] *= 1e-3  # weight of a joint with something unexplained
             for edge in (found.since_s, found.over_s):
                 weight[np.abs(t - edge) < EDGE_S] = 0.0
         return weight

@@ -18,7 +18,6 @@ from adapter.model.spatial import Array
 
 WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
 DATES = 50.0  # starts that were looked at
-SAME_SHARE = 0.5  # of a signature that another name for it explains
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class Rival:
     @property
     def is_alike(self) -> bool:
         """Whether it is another name for the named effect, and not another effect."""
-        return self.overlap > SAME_SHARE
+        return self.overlap > 0.5  # of a signature that another name for it explains
 
 
 @dataclass(frozen=True, eq=False)

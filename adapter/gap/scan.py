@@ -48,8 +48,6 @@ BLOCK_S, DATE_STEP_S = 0.4, 0.04
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 AT_ONCE = 24  # candidates of a long recording
 FEWEST_BLOCKS = 1  # nothing shorter is dated
-FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
-RICH_ROUNDS = 2
 LONGEST_CONTACT_S = 8.0
 MARGIN_S = 0.8  # a start so near either end is no change
 
@@ -99,11 +97,11 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, heard
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
-    sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
+    sigma = 0.2 * residual.std(axis=0) + LEAST_NM  # of the residual that may be noise, for a start
     white, data = X[used], (residual / sigma).ravel()
     white *= heard / sigma
     white = white.reshape(len(used), -1)
-    for _ in range(RICH_ROUNDS):
+    for _ in range(2):
         information = white @ white.T
         information[np.diag_indices(len(used))] += prior[used] ** -2.0
         x[used] = cho_solve(cho_factor(information, lower=True), white @ data)

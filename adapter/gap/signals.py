@@ -55,7 +55,6 @@ RARELY = 25  # rows of the band, a second
 SPLINE_DEGREE = 5
 KNOT_S = 0.02  # a joint does nothing that we model within 40 ms
 Q_NOISE_FLOOR, DQ_NOISE_FLOOR = 2e-6, 2e-5  # rad, rad/s: of signals without noise
-STIFFNESS = (-16.0, 6.0)  # range of ln of the penalty on the squared third derivative
 
 # A recording again, or as a forward simulation takes it.
 COMMANDS, MEASURED = "commands", "measured"
@@ -498,7 +497,7 @@ def smoothness_of(parts: Sequence[Splines]) -> Smoothness:
         costs = [_cost_of(*part.known(j, q_noise[j], dq_noise[j]), part.rough) for part in parts]
         best = minimize_scalar(
             lambda x, costs=costs: sum(cost(x) for cost in costs),
-            bounds=STIFFNESS,
+            bounds=(-16.0, 6.0),  # range of ln of the penalty on the squared third derivative
             method="bounded",
             options={"xatol": 0.2},
         )

@@ -42,8 +42,6 @@ DOCUMENTED_STD, WEIGHED_STD = 0.1, 0.2  # of the inertias: alone, and beside a k
 GAIN_STD = 0.5  # of a gain, as a share of what one joint's regression says
 KNOWN_SHARE = 1e-3  # to which a known mass is weighed
 ROUNDS, NOISE_ROUNDS, STEPS = 3, 3, 4  # of the whole; of noise after fit; of each fit
-SETTLED = 2e-3  # share of a gain that ends the rounds
-SHOWN_SHARE = 0.25  # one standard deviation, above which a gain is not shown
 LEARNED_SHARE = 2.0 / 3.0  # of every recording, for the check on the rest
 SLIDES_RAD_S, AROUND_S = 0.1, 0.1  # slower, so long before or after, a joint sticks
 GAIN = CATALOGUE["torque_gain"]
@@ -186,7 +184,7 @@ def learn_gains(
     first, fit, _ = _fitted(replace(task, recordings=tuple(begun)), start)
     held_out, size = _on_the_rest(task, fit, first)
     gain, fit, std = _fitted(task, first)
-    shown = std < SHOWN_SHARE * np.abs(gain)
+    shown = std < 0.25 * np.abs(gain)  # one standard deviation, above which a gain is not shown
     if shown.any():
         gain = np.where(shown, gain, np.median(gain[shown]))
     moved = float(np.abs(first / gain - 1.0)[shown].max(initial=0.0))
@@ -230,7 +228,7 @@ def _fitted(task: _GainTask, gain: Array) -> tuple[Array, Fit, Array]:
         step = np.zeros(n)
         step[at] = fit.coefficients[off]
         gain = gain / (1.0 + step)
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < 2e-3:  # share of a gain that ends the rounds
             break
     doubt = np.full(n, np.inf)
     covariance = honest_covariance(fit, carried)

@@ -35,9 +35,7 @@ OWN = 13  # unknowns of a sensor: turn, place, biases of w and a, lateness
 MAINLY = 0.3  # of a gauge's step; a frame that it moves by more is said not to be known along it
 LEAST_STD = 1e-9  # rad/s, m/s²: no sensor is trusted more
 WILD = 6.0  # standard deviations; a window that is further off is not believed
-STEPS = 30
 SMALL_STEP = 0.1  # in standard deviations, of all unknowns together: has arrived
-COST_ROUNDING = 1e-9
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0
 
 
@@ -215,13 +213,13 @@ class ImuFit:
         """Gauss-Newton from `at`, damped where a step does not lower the cost."""
         damping = 0.0
         stds, slope = self._slope(at, prior)
-        for _ in range(STEPS):
+        for _ in range(30):
             free = self._free(at)
             H = free.T @ slope.curvature @ free
             damped = H + damping * np.diag(H.diagonal())
             step = -free @ np.linalg.solve(damped, free.T @ slope.gradient)
             trial = at.moved(step)
-            if self._cost(trial, stds, prior) > slope.cost * (1.0 + COST_ROUNDING):
+            if self._cost(trial, stds, prior) > slope.cost * (1.0 + 1e-9):
                 damping = max(10.0 * damping, FIRST_DAMPING)
                 if damping > MOST_DAMPING:
                     break

@@ -24,8 +24,6 @@ FIRST_S, GROWTH, MOST_S = 1.0, 1.25, 4.0  # of motion: first solution, and from 
 HELD_S = 60.0  # of readings; the older half of more becomes a paraboloid
 LAST_WORD = 100  # updates without a new reading: what is left is solved, too
 SLOWEST_HZ = 40.0
-FEWEST = 20  # readings of a sensor
-SHOWN = 10.0  # times what the springs say
 ASTRAY = 0.2  # of how a sensor turns; one that is off by more is not on that link, or mad
 SURE = 2.0  # standard deviations that λ may move from one solution to the next
 HEARD, W, A = 0, slice(3, 6), slice(6, 9)  # of the motion row of a link
@@ -172,7 +170,7 @@ class ImuSchema(Schema):
             own = slice(6 * j, 6 * j + 6)
             values, vectors = np.linalg.eigh(basis.T @ found.covariance[own, own] @ basis)
             vectors = basis @ vectors
-            shown = values < FRAME_STD**2 / SHOWN
+            shown = values < FRAME_STD**2 / 10.0  # times what the springs say
             certain = shown & (values < self.settings.std_goal**2)
             self._covariance[j] = (vectors[:, shown] * values[shown]) @ vectors[:, shown].T
             self.identifiable[j] = vectors[:, shown] @ vectors[:, shown].T
@@ -227,7 +225,7 @@ class ImuSchema(Schema):
 
 def _wrong(t_s: Array, told: Array) -> str | None:
     """Why readings (k, 6) of a sensor cannot be used; None where they can."""
-    if len(t_s) < FEWEST:
+    if len(t_s) < 20:  # readings of a sensor
         return f"was heard {len(t_s)} times"
     rate = 1.0 / float(np.median(np.diff(t_s)))
     if rate < SLOWEST_HZ:

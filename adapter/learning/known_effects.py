@@ -20,7 +20,6 @@ from adapter.physics.kernels import JointMotion, jit
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns, stamps_of
 
-LONGEST_STEP_NS = 20_000_000  # between two states that a rate is taken from
 # On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's torque:
 # 0.10 N m without smoothing, 0.01 with.
 TWIST_SMOOTHING_S = 0.03
@@ -47,7 +46,7 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
         q, dq = table[m, at.q : at.dq], table[m, at.dq : at.ddq]
         ddq, tau = table[m, at.ddq : at.tau], table[m, at.tau : at.base]
         step = stamps[m] - clock[0]
-        if step <= 0 or step > LONGEST_STEP_NS:
+        if step <= 0 or step > 20_000_000:  # between two states that a rate is taken from
             clock[1] = 0
         dt = 1e-9 * step
         for j in range(n):

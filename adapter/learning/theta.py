@@ -51,7 +51,6 @@ from adapter.signals.records import StateLayout
 
 # Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
 NEUTRAL_MASS = 1.0  # kg
-NEUTRAL_INERTIA = 0.02  # kg m², about every axis
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
 WIDEST_BODY = 100.0  # times these, where data say that a body is so heavy
 
@@ -59,7 +58,6 @@ REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
 # has fallen to this share of what it may be is not there.
 REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
-SPREAD_STEPS = 50  # at each look at how large the effects are
 # Of an effect that has several shapes: the first one in use, how many are tried at a look, and by
 # what another must be better, in squares of standard deviations.
 FIRST_SHAPE, SHAPES_TRIED, SHAPE_EVIDENCE = 2, 25, 2.0
@@ -76,13 +74,12 @@ STEP_SMOOTHING = 0.6
 HANGING_SHARE = 0.03
 BASE_LEVEL_SAMPLES = 2000  # that the running mean of the base's squared errors spans
 
-SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
 LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
 
 
 def neutral_body() -> Array:
     """(10,) what is believed of a link before any data."""
-    return theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
+    return theta_from_body(NEUTRAL_MASS, np.zeros(3), 0.02 * np.eye(3))  # kg m², about every axis
 
 
 @dataclass(frozen=True)
@@ -389,7 +386,7 @@ class Theta:
         th[spare] = link
         at = np.arange(spare.start, spare.start + 4)
         mass, *moment = np.linalg.solve(H[np.ix_(at, at)], rhs[at] - H[at] @ th)
-        if mass < SMALLEST_LOAD:
+        if mass < 0.01:  # kg; below it the start after a change is the link as it was
             return
         centre = np.array(moment) / mass
         load = theta_from_body(mass, centre, mass * LOAD_RADIUS**2 * np.eye(3))
@@ -799,7 +796,7 @@ def likely_spread(x: Array, variance: Array, spread: float) -> float:
     """
     data = np.maximum(1.0 / variance - 1.0 / spread**2, 0.0)
     told, square = x / variance, spread**2
-    for _ in range(SPREAD_STEPS):
+    for _ in range(50):  # at each look at how large the effects are
         variance = 1.0 / (1.0 / square + data)
         square = float(np.mean((variance * told) ** 2 + variance))
     return math.sqrt(square)

@@ -48,7 +48,6 @@ NEAR_UNIT = 3.0  # a unit so far from the size that torques have is worth trying
 SIZE_ROUNDS, LEAST_FACTOR = 4, 1.5  # of one joint's size; gains and friction explain less
 G, ASKEW_RAD = 9.81, np.deg2rad(15.0)  # m/s²; a load bends what torques say of gravity so far
 TILT_RAD = np.deg2rad(20.0)  # of gravity; less is a base that stands askew
-ZEROS = np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0])
 NEAR = 2  # joints up to which an axis may be told against another (parallel links)
 CURRENTS = (
     "convert them with --tau-gain G1,G2,... (N m per recorded unit, one per joint or one for "
@@ -245,7 +244,7 @@ class Readings:
         turn, name = 1.0 - 2.0 * unit, self.names[j]
         said = f"{name} counts the other way round: --turn {name}"
         yield Reading("joint", said, rows.turned(np.diag(turn))._replace(tau=rows.tau * turn))
-        for zero in ZEROS:
+        for zero in np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0]):
             way = "more" if zero > 0.0 else "less"
             said = (
                 f"the zero of {name} is elsewhere than the model's: its own angle is "

@@ -26,10 +26,7 @@ HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower sou
 CUT_HZ = 8.0  # band in which velocity and position are compared: arms move below it
 MOVES_DQ = 0.02  # rad/s; slower is noise
 FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
-STEPS_OF_LATENESS = 3  # each repeats the linearised fit about the last one
-SIGNIFICANT = 3.0  # standard deviations
 TIMING_SHARE = 0.25  # of a sample period: a hold of half a sample, two of these, is no effect
-LEAST_STD_S = 1e-6  # of a lateness; no clock is better
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
 
 Index = NDArray[np.int64]
@@ -156,7 +153,7 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
         np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s")
     )
     told = np.isfinite(late) & np.isfinite(std)
-    weight = np.maximum(std[told], LEAST_STD_S) ** -2.0
+    weight = np.maximum(std[told], 1e-6) ** -2.0  # of a lateness; no clock is better
     gains = np.array([c.velocity_gain for c in clocks])
     seen = np.isfinite(gains).any(axis=0)
 
@@ -191,7 +188,7 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
 def lateness(clock: RecordingClock) -> float:
     """How much later dq is than q, where that is known, s."""
     late, std = clock.lateness_s, clock.lateness_std_s
-    return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
+    return late if np.isfinite(late) and abs(late) > 3.0 * std else 0.0  # standard deviations
 
 
 def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingClock:
@@ -376,7 +373,7 @@ def _lateness(t: Array, q: Array, dq: Array, period_s: float) -> tuple[float, fl
     smooth = sosfiltfilt(sos, table, axis=0)
     rate = np.gradient(smooth[:, :n], step_s, axis=0)
     late_s, found = 0.0, nothing
-    for _ in range(STEPS_OF_LATENESS):
+    for _ in range(3):  # each repeats the linearised fit about the last one
         moved = np.column_stack([np.interp(grid - late_s, grid, x) for x in rate.T])
         change, std_s, gain = _fit(moved, smooth[:, n:], step_s, pick)
         if not np.isfinite(change):

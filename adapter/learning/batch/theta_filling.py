@@ -31,7 +31,6 @@ from adapter.model.inertia import (
 from adapter.model.spatial import Array
 
 KEPT = 0.05  # of a documented body that is left of it at least, where what was learned allows it
-LEAST_KEPT = 1e-3  # the same where no possible body has what was learned
 LEAST_SIZE = 1e-3  # share of a measuring body, and kg, that a documented one has at least
 # m: as if documented bodies were spread so far about their centres at least, others are measured. A
 # rod or a point is not spread; beside a flat one (the Panda's second link) some millimetres weighed
@@ -211,7 +210,7 @@ def _nearest_by_torque(measure: Measure, start: Array, regressor: Array) -> Fill
         quadratic,
         -table.T @ (table @ start) - NEARNESS * measure.told,
         -np.eye(len(start)),
-        -LEAST_KEPT * measure.own,
+        -1e-3 * measure.own,  # the same where no possible body has what was learned
         measure.cones,
     )
     least = measure.least(share) if np.isfinite(share).all() else 0.0
