@@ -251,7 +251,6 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
 
 
 SLOW_PIECES = 10  # over time
-LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
 LINE_HZ = (0.15, 9.0)
 SHARPENED, FINE = 12, 40  # rounds in which a line's frequency is sharpened; steps either way
 
@@ -367,7 +366,7 @@ def line_hz(residual: Array, rate_hz: float) -> float | None:
     inside = (f > LINE_HZ[0]) & (f < LINE_HZ[1])
     peak = int(np.argmax(np.where(inside, power, 0.0)))
     near = power[max(peak - 20, 1) : peak + 20]
-    if power[peak] < LINE_RATIO * np.median(near):
+    if power[peak] < 30.0 * np.median(near):  # a spectral line must stand out so much
         return None
     # the top of the parabola through the peak's logarithms
     a, b, c = np.log(power[peak - 1 : peak + 2] + 1e-300)

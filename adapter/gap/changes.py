@@ -32,7 +32,6 @@ from adapter.screening.screen import moving_joints
 WINDOW_S, MOST_WINDOWS = 2.0, 2048
 CHANGES, LOUD = 3, 1  # stretches that are added at most: around changes, where it is loud
 AROUND_S = 4.0  # length of one
-LEAST_CHI2 = 200.0  # of a change, times what windows scatter more than noise does
 MARGIN = 2  # windows at either end
 
 
@@ -88,7 +87,7 @@ class Windows:
         spans = [(0, len(self.rows))]
         while spans and len(found) < CHANGES:
             chi2, k, span = max((*self._best(*span), span) for span in spans)
-            if chi2 < LEAST_CHI2 * max(self.usual, 1.0):
+            if chi2 < 200.0 * max(self.usual, 1.0):  # above what windows scatter
                 break
             found.append(k)
             spans.remove(span)

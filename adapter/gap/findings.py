@@ -24,10 +24,8 @@ from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
 
 OFFSET, SPRING = "torque_offset", "joint_spring"
-SHOWN_CHI2 = 4.0  # of an offset: two standard deviations
 OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
 ODD = 4.0  # standard deviations from which on a correction is a finding
-DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
 SMOOTH, BEFORE = 3.5, 6  # level of a residual over what so many samples before do not foretell
@@ -116,7 +114,7 @@ def _std_of(
 ) -> Array:
     """Standard deviations (p,) of what hangs on the parameters of the k-th named effect."""
     named, own = fit.named[k], place_of(fit, k)
-    decode, steps = named.candidate.template.decode, DIFFERENCE * named.candidate.prior_std
+    decode, steps = named.candidate.template.decode, 1e-4 * named.candidate.prior_std  # of a prior
     at = of_values(named.values)
     slopes = np.array(
         [
@@ -207,7 +205,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     shifted = {
         e.candidate.joint
         for e, standing in zip(fit.named, found.standings, strict=True)
-        if e.candidate.effect.name == OFFSET and standing.chi2 > SHOWN_CHI2
+        if e.candidate.effect.name == OFFSET and standing.chi2 > 4.0  # two standard deviations
     }
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
@@ -287,7 +285,7 @@ def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, floa
         effect = rival.candidate.effect
         if isinstance(effect, Pattern) or effect.name == standing.candidate.effect.name:
             continue
-        if rival.overlap >= 0.9 and _is_open(standing, rival, named, shifted):
+        if rival.overlap >= 0.9 and _is_open(standing, rival, shifted):
             best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
     # of rivals that explain all but the same, those that the data favour come first
     credible = {r.candidate.effect.name: -i for i, r in enumerate(standing.rivals[::-1])}
@@ -295,7 +293,7 @@ def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, floa
     return {name: best[name] for name in order[:3]}  # the likeliest
 
 
-def _is_open(standing: Standing, rival: Rival, named: Named, shifted: bool) -> bool:
+def _is_open(standing: Standing, rival: Rival, shifted: bool) -> bool:
     """Whether the data leave a rival open that is a finer form of the named effect or a coarser.
 
     Friction and an offset of the same joint are asymmetric friction in other words.

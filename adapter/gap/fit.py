@@ -30,12 +30,10 @@ from adapter.model.spatial import Array
 TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
 EDGE = 0.3  # of a jump of added torque: friction turns round more softly than its equation
-JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
-HALVED = 7  # steps between two settings, each half of the one before
 WIDER = 2.0  # than what any arm has: what may have a name beside it
 MOST_FITTED = 0.5  # of independent rows that coefficients may have taken
 
@@ -435,7 +433,7 @@ def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
 def unsure(model: Model, recording: int, place: int) -> Array:
     """(k, n) by how much a named effect's torque may be otherwise in truth, N m."""
     effect, own = model.named[place].candidate.effect, model.recordings[recording]
-    torque, (back, ahead) = model.contribution(recording, place), JUMP_ROWS
+    torque, (back, ahead) = model.contribution(recording, place), (4, 2)  # rows around a jump
     size, shift = back + ahead + 1, (back - ahead) // 2
     # how much it changes around each instant
     jumps = maximum_filter1d(torque, size, axis=0, origin=shift)
@@ -571,7 +569,7 @@ def between(fit: Fit, place: int, value: float, step: float, at: Callable[[float
     """A named effect with the setting near `value` that the data like best, up to a fine step."""
     carried = fit.carried()
     best, named = carried, fit.named[place]
-    for finer in step * 0.5 ** np.arange(1, HALVED):
+    for finer in step * 0.5 ** np.arange(1, 7):  # each half of the one before
         for other in (value - finer, value + finer):
             trial = _with_shape(fit, carried, place, at(other))
             if trial.g @ trial.x > best.g @ best.x:

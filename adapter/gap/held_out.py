@@ -33,9 +33,7 @@ from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
 from adapter.signals.validation import smooth
 from adapter.simulate import DrivenMotion, Simulate
 
-SMEARED_MS = 101  # about an instant, in which the recipe's filter mixes torques
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
-ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
@@ -152,7 +150,7 @@ def torque_errors(
         rows = fold == f
         if rows.any():
             new[rows] = (tau - ModelTorque(model, own_log=True)(q, dq, ddq, t, sharp))[rows]
-    unheard = maximum_filter1d(~recording.heard_at(t), SMEARED_MS, axis=0)
+    unheard = maximum_filter1d(~recording.heard_at(t), 101, axis=0)  # ms that its filter mixes
     old[unheard] = new[unheard] = np.nan
     edge = round(RECIPE_EDGE_S / 1e-3)
     return ErrorsOverTime(t[edge:-edge], old[edge:-edge], new[edge:-edge])
@@ -420,7 +418,7 @@ def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
         if from_the_start(fit.named[k]):
             continue
         size = np.abs(fit.model.contribution(fit.named[k].recording or 0, k)).max(axis=0)
-        if (size[joints] > ACTS * size.max()).any():
+        if (size[joints] > 0.1 * size.max()).any():  # a joint that it acts on
             less = _without(found, (k,))
             out.append(less if fit.dtheta.any() else uncorrected(less))
     return out

@@ -18,7 +18,6 @@ from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, BEST_OF_JOINT, FORMS, Lead, SignatureTable
 
 STRIBECK = CATALOGUE["stribeck_friction"]
-MOST_TERMS = 3  # of one joint: more are a curve with another name
 STEP = 0.1  # of what was seen: between two settings that are tried
 
 
@@ -30,7 +29,7 @@ def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
     for joint in sorted({e.candidate.joint for e in fit.named if _gives_way(e)}):
         if any(e.candidate.joint == joint and _nameless(e) for e in fit.named):
             fit = falling(fit, joint)
-        fit = _of_joint(fit, joint, MOST_TERMS if joint not in without else 0)
+        fit = _of_joint(fit, joint, 3 if joint not in without else 0)  # more are a curve
     return fit
 
 

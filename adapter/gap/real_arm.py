@@ -46,7 +46,6 @@ BRISTLES = CATALOGUE["bristle_friction"]
 EVERYWHERE = (BRISTLES, OFFSET)
 SPRING = CATALOGUE["joint_spring"]
 DRIVEN = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"])
-USUAL = {BRISTLES: 1}  # of the templates: bristles of a Panda
 # Of the whole arm: what its torques lack of the motion's band, and a table that is not level
 OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
 AT_ZERO = 1e-3  # N m/rad: where a spring rests is in the offset beside it
@@ -217,7 +216,7 @@ def _named(effect: Effect, template: Template, joint: int) -> Named:
 
 def _assumed(effect: Effect, joint: int) -> Named:
     """An effect that any arm has, of its usual size (`priors`, or as its template says)."""
-    template = effect.templates()[USUAL.get(effect, 0)]
+    template = effect.templates()[1 if effect is BRISTLES else 0]  # bristles of a Panda
     if effect.name in EFFECT_STD:
         std = EFFECT_STD[effect.name], *[AT_ZERO] * (len(template.prior_std) - 1)
         template = replace(template, prior_std=std)

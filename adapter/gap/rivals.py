@@ -16,7 +16,6 @@ from adapter.gap.fit import Fit, Named, beside, distance_of, refitted
 from adapter.gap.scan import SignatureTable
 from adapter.model.spatial import Array
 
-WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
 DATES = 50.0  # starts that were looked at
 
 
@@ -197,7 +196,7 @@ def _rivals(
         G = np.array([products.own[i] for i in places])
         G -= solved[at] @ C[at].swapaxes(1, 2)
         evidence, chi2, x = scores(G, left[at], std)
-        wide = G + (WIDE * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])
+        wide = G + (10.0 * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])  # how far it could go
         reached = np.linalg.solve(wide, cross[at][..., None])[..., 0]
         overlap = np.einsum("bi,bi->b", cross[at], reached) / size
         for b, i in enumerate(places):

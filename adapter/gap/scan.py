@@ -47,7 +47,6 @@ CATALOGUED, PATTERNS, FORMS = "catalogued", "patterns", "forms"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 AT_ONCE = 24  # candidates of a long recording
-FEWEST_BLOCKS = 1  # nothing shorter is dated
 LONGEST_CONTACT_S = 8.0
 MARGIN_S = 0.8  # a start so near either end is no change
 
@@ -313,7 +312,7 @@ class SignatureTable:
         for i, t in enumerate(self.times):
             last = len(_edges(t)) - 1
             ends = [(a, min(a + longest, last - 1)) for a in range(1, last)]
-            pairs = [(a, b) for a, end in ends for b in range(a + FEWEST_BLOCKS, end + 1)]
+            pairs = [(a, b) for a, end in ends for b in range(a + 1, end + 1)]
             edges = _edges(t)  # no push lasts for what was left out between two stretches
             pairs = [(a, b) for a, b in pairs if edges[b] - edges[a] < LONGEST_CONTACT_S + BLOCK_S]
             leads += self._best_intervals(i, candidates, pairs, passing=True)

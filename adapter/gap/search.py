@@ -42,11 +42,9 @@ from adapter.gap.scan import (
 )
 
 ROUNDS = 24  # some seven are made where every joint has friction of its own
-CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 8, 0.0  # names that are exchanged for better ones, and by how much
 LOST = 1.2  # times the residual that a simpler name may leave
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
-CLEAR = 3.0  # standard deviations of a force
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
 FALLS_CHI2 = 4.0  # that friction which falls with the speed must say more to be looked at closely
 RESOLVED_CHI2 = 4.0  # that bristles must be better than friction that slides at once
@@ -230,7 +228,7 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
         own = [c for c in table.candidates if c.joint == joint and isinstance(c.effect, Pattern)]
         patterns = [table.lead_of(c) for c in own]
         best = max(map(table.honest, patterns), key=lambda x: x.chi2)
-        if named.chi2 < (CURVE_SHARE if curve else PATTERN_SHARE) * best.chi2:
+        if named.chi2 < (1.1 if curve else PATTERN_SHARE) * best.chi2:  # two words for one curve
             fit = _with(bare, Move((best,), best.log_evidence), table.fit.noise) or fit
     return fit
 
@@ -393,7 +391,7 @@ def _stands_out(fit: Fit, carried: Carried, k: int) -> bool:
             return False
         force = aside
     square = float(force @ force)
-    return square**2 > CLEAR**2 * float(force @ doubt @ force)
+    return square**2 > 3.0**2 * float(force @ doubt @ force)  # standard deviations
 
 
 def _swapped(fit: Fit, standings: Sequence[Standing], unnamed: Container[int]) -> Fit | None:

@@ -40,8 +40,6 @@ TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
 BAND_MARGIN = 1.3  # of a torque's band, over where it no longer stands out of noise
 CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at least
-MASSES = 20  # instants at which the mass matrix is asked for
-MANY = 100  # signals that are worth a look whether some are zero
 LEAST_S = 1.2  # of a recording, and of a stretch between pauses
 HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
@@ -49,7 +47,6 @@ MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 
-RARELY = 25  # rows of the band, a second
 
 # Splines through a motion.
 SPLINE_DEGREE = 5
@@ -61,7 +58,6 @@ COMMANDS, MEASURED = "commands", "measured"
 ROLLOUT_STEP_S = 1e-3
 SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; compared so often
 SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
-COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
 UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
 FAR_S = 0.05  # a command older than that does not drive any more
 HOLE_S = 0.05  # between samples: what happened in there is not known
@@ -71,7 +67,7 @@ ROLLOUT_EDGE_S = 0.3
 def low(x: Array) -> Array:
     """Signals (m, ...) at 250 Hz in the band, (k, ...) at 25 Hz; the ends are left out."""
     flat, shape = x.reshape(len(x), -1), x.shape[1:]
-    if flat.shape[1] > MANY:  # half of a regressor is zero
+    if flat.shape[1] > 100:  # half of a regressor is zero
         used = flat.any(axis=0)
         if not used.all():
             out = np.zeros((_size_of_low(len(x)), flat.shape[1]))
@@ -188,7 +184,7 @@ class Signals:
     @property
     def sliding(self) -> Array:
         """(k, n) one there, else zero; where a joint hardly slides, all that is measured."""
-        return np.where(self.slides.sum(axis=0) < RARELY, self.heard, self.slides)
+        return np.where(self.slides.sum(axis=0) < 25, self.heard, self.slides)  # rows: a second
 
     @cached_property
     def slowness(self) -> Array:
@@ -269,7 +265,7 @@ def bands_of(motion: Motion, noise: Array) -> Array:
     Infinite where it does as far as torques are compared. `noise` is (n,) rad²/s²/Hz, of dq.
     """
     arm = motion.arm
-    some = motion.q[:: max(len(motion.q) // MASSES, 1)]
+    some = motion.q[:: max(len(motion.q) // 20, 1)]  # instants for the mass matrix
     rest = np.zeros_like(some)
     held = arm.torque(some, rest, rest)
     mass = [arm.torque(some, rest, rest + unit) - held for unit in np.eye(arm.n)]
@@ -430,7 +426,7 @@ class Recorded:
         """Commands (m, n) at times t; None where there are none for part of the time."""
         if self.command_t is None or self.commands is None or len(self.command_t) < 2:
             return None
-        at = self.command_t + COMMAND_DELAY_S
+        at = self.command_t + 1e-3  # it is reached at the end of the next period
         inside = at[(at > t[0] - FAR_S) & (at < t[-1] + FAR_S)] if len(t) else at[:0]
         if len(inside) < 2 or inside[0] > t[0] + FAR_S or inside[-1] < t[-1] - FAR_S:
             return None

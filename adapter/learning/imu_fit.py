@@ -35,7 +35,6 @@ OWN = 13  # unknowns of a sensor: turn, place, biases of w and a, lateness
 MAINLY = 0.3  # of a gauge's step; a frame that it moves by more is said not to be known along it
 LEAST_STD = 1e-9  # rad/s, m/s²: no sensor is trusted more
 WILD = 6.0  # standard deviations; a window that is further off is not believed
-SMALL_STEP = 0.1  # in standard deviations, of all unknowns together: has arrived
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0
 
 
@@ -226,7 +225,7 @@ class ImuFit:
                 continue
             at, damping = trial, 0.1 * damping if damping > FIRST_DAMPING else 0.0
             stds, slope = self._slope(at, prior)
-            if float(step @ slope.curvature @ step) < SMALL_STEP**2:
+            if float(step @ slope.curvature @ step) < 0.1**2:  # in standard deviations
                 break
         free = self._free(at)
         covariance = free @ np.linalg.inv(free.T @ slope.curvature @ free) @ free.T

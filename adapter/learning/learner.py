@@ -35,13 +35,11 @@ NOISE_STATES = 5000  # newest ones, whose errors tell for how long the noise kee
 AHEAD = 100  # states that are looked at for one call of `steps`
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
-REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
 # Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up in
 # motion, 0.88 at most where friction turned around).
 LOAD_SHARE = 0.95
-NEW_SHARE = 0.5  # of an error's power at velocities that are new: it is of those
 MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
 
 
@@ -539,7 +537,7 @@ class OnlineLearner:
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
         power, seen = np.square(error / size), self.rates_seen
         new = is_new(table[:, at.dq.start : at.ddq.stop], seen)
-        if len(seen) and power[new].sum() > NEW_SHARE * power.sum():
+        if len(seen) and power[new].sum() > 0.5 * power.sum():  # they are of what is new
             return False
         begin = self.theta.hand.start
         load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
@@ -572,7 +570,7 @@ class OnlineLearner:
     def _strayed(self) -> bool:
         """Whether λ has left the frames of θ's moments by more than it is sure of."""
         std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
-        allowed = np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
+        allowed = np.maximum(self.settings.rebuild_stds * std, 1e-5)  # rad, m: no sensor shows it
         return self.schema.strayed(*self.frames, allowed)
 
     def _begin_rebuild(self) -> None:

@@ -62,8 +62,6 @@ PATIENCE = 5
 LONGEST_WAIT_NS = 50_000_000  # what counts of the time between two looks at a λ that stands still
 SETTLED_LOOK_NS = LONGEST_WAIT_NS  # between two looks at a λ that has converged
 EXACT_DISTANCE = 1e-6  # rad, m: what may be left to the optimum of motion without noise
-FEWEST_DIFFERENCES = 50  # third differences that say something of the noise
-LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none
 # Where dw is carried by λ: samples between two looks at λ, and the turn (rad) in between that
 # spoils them.
 CARRIED_SAMPLES, CARRIED_TURN = 400, 2e-3
@@ -134,7 +132,7 @@ class Schema:
             np.zeros((newest, 3, 15, 15)),
             np.zeros((n + 1, 4)),
             np.zeros((3, n + 1, 12)),
-            np.array([LONG_AGO_NS, 2**62]),
+            np.array([-(2**61), 2**62]),  # before any stamp: the first sample follows none
             np.zeros(len(Count)),
         )
         self._moments = tuple(self.moments)
@@ -268,7 +266,7 @@ class Schema:
         noise.
         """
         moments, differences = self.moments, self.moments.counts[Count.DIFFERENCES]
-        if self.kind != LinkMotionKind.MEASURED or differences < FEWEST_DIFFERENCES:
+        if self.kind != LinkMotionKind.MEASURED or differences < 50:  # too few to tell
             return np.zeros_like(moments.noise_power)
         found = moments.noise_power / (THIRD_DIFFERENCE_GAIN * differences)
         left = np.empty((len(self.p), 3))

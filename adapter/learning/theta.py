@@ -52,7 +52,6 @@ from adapter.signals.records import StateLayout
 # Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
 NEUTRAL_MASS = 1.0  # kg
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
-WIDEST_BODY = 100.0  # times these, where data say that a body is so heavy
 
 REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
@@ -72,9 +71,6 @@ STEP_SMOOTHING = 0.6
 # What the base's wrench has to say on the links that hang on it: enough to decide what torques
 # leave open, little enough that the noise of the base's own motion bends nothing that they show.
 HANGING_SHARE = 0.03
-BASE_LEVEL_SAMPLES = 2000  # that the running mean of the base's squared errors spans
-
-LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
 
 
 def neutral_body() -> Array:
@@ -248,7 +244,7 @@ class Theta:
         A = np.zeros(int((widths * (widths + 1) // 2).sum()))
         floating = int(self.tree.floating)
         C = np.zeros((2 * floating, len(self.rows.near), len(self.rows.base_place) + 1))
-        level = np.zeros(6 * floating), np.array([0.0, BASE_LEVEL_SAMPLES])
+        level = np.zeros(6 * floating), np.array([0.0, 2000.0])  # samples it spans
         return Moments(A, C, *level, np.zeros(self.tree.n))
 
     def absorb(self, frames: tuple[Array, Array], table: Array) -> Array:
@@ -389,7 +385,7 @@ class Theta:
         if mass < 0.01:  # kg; below it the start after a change is the link as it was
             return
         centre = np.array(moment) / mass
-        load = theta_from_body(mass, centre, mass * LOAD_RADIUS**2 * np.eye(3))
+        load = theta_from_body(mass, centre, mass * 0.03**2 * np.eye(3))  # m, of gyration
         if min_eigenvalue(link + load) <= 0.0:
             return
         self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
@@ -492,7 +488,7 @@ class Theta:
         shown = pulled < 0.5
         away = np.where(shown, x / np.maximum(1.0 - pulled, 0.5), 0.0)  # as data alone have it
         square = np.sum(away**2, axis=1) / np.maximum(shown.sum(axis=1), 1)
-        spread = np.clip(np.sqrt(square), before, WIDEST_BODY)
+        spread = np.clip(np.sqrt(square), before, 100.0)  # times the prior's
         more = np.outer(1.0 / spread**2 - 1.0 / before**2, 1.0 / PRIOR_STD**2).ravel()
         self.prior[at, at] += more
         self.prior_rhs[at] += more * np.tile(neutral_body(), len(spread))

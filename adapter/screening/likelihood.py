@@ -32,7 +32,6 @@ SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's n
 CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
 HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
 REST = 0.3  # root of the weight of a row at rest: a second of them is about one independent one
-ROUNDS = 6  # of noise after fit; it settles in three
 EVIDENCE = 40.0  # twice the log-likelihood that a reading must gain: odds of 1 to 500 million
 ROWS = 100  # instants that are judged
 BEYOND_RAD, BEYOND = 0.2, 100.0  # over a limit; what a recording all beyond it costs
@@ -164,7 +163,7 @@ class Telling:
         def of(tau: Array) -> Explained:
             apart, sigma = counts * (tau - model), plausible_nm(model)
             products = np.einsum("mjk,mj->jk", columns, apart)
-            for _ in range(ROUNDS):
+            for _ in range(6):  # of noise after fit; it settles in three
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
                 normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
                 x = np.linalg.solve(normal, weight @ products)

@@ -46,7 +46,6 @@ TURNS_RAD = 4.0 * np.pi  # no arm joint turns further than two turns either way
 BEYOND_RAD, BEYOND_SHARE = 0.2, 0.05  # over the limit, and in which share of the samples
 EVERY = 40  # ms at least between the rows that are judged
 FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
-PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
 LEAST_TILT_RAD = np.deg2rad(1.0)  # of a base: so well a table is level
 NAMED_LATE_S = 0.02  # of torques: what is less a bus and a filter make, which `gap` names
 DDQ_S = 0.02  # either side of an instant, over which velocities tell accelerations
@@ -497,7 +496,7 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
     behind = pauses(stamps_s)
     stamps_s[1:] -= np.cumsum(
-        np.maximum(np.diff(stamps_s) - PAUSE_S, 0.0)
+        np.maximum(np.diff(stamps_s) - 1.0, 0.0)  # what is left of a longer pause
     )  # a clock that steps on by hours
     signals = smooth(stamps_s, log.q, log.dq, log.tau)
     t, clear = GRID_S * np.arange(len(signals[0])), np.ones(len(signals[0]), dtype=bool)

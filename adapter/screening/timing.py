@@ -20,9 +20,7 @@ AROUND = 5  # samples, of which the middle one tells where a reading should be
 SPIKE_TIMES, SPIKE_SHARE = 15.0, 0.2
 PUT_BACK_S = 1.0  # of a pause where a clock was put back, which says nothing of how long it took
 WRAP_RAD = 0.5  # between two samples; a step so near a whole turn is none
-HELD_NM = 0.3  # that the arm holds throughout, so that torques of zero are none
 FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
-HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower source
 CUT_HZ = 8.0  # band in which velocity and position are compared: arms move below it
 MOVES_DQ = 0.02  # rad/s; slower is noise
 FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
@@ -76,7 +74,7 @@ class RecordingClock:
     def hold_lag_s(self, signal: str) -> float:
         """Mean age of a signal that arrives more often than it is updated; 0 where it is new."""
         share = self.held[signal]
-        if share < HELD_SHARE or share > 0.999:
+        if share < 0.3 or share > 0.999:  # more is a slower source
             return 0.0
         return 0.5 * self.period_s * share / (1.0 - share)
 
@@ -313,7 +311,7 @@ def unsaid(tau: Array) -> NDArray[np.bool_]:
     if not dead.any() or dead.all():
         return np.zeros(len(tau), dtype=bool)
     holds = np.percentile(np.abs(tau[~dead]).max(axis=1), 10)
-    return np.asarray(dead & (holds > HELD_NM))
+    return np.asarray(dead & (holds > 0.3))  # so zeros are none
 
 
 def _same(x: Array) -> NDArray[np.bool_]:

@@ -28,7 +28,6 @@ from adapter.physics.freedom import Freedom
 RESIDUAL_FLOOR = 1e-14
 # Noise alone makes curvature of the size of the square root of the count (schema learner).
 NOISE_CURVATURE = 10.0
-ROUNDS = 2  # of weighting by what the fit leaves
 LARGEST_STD = 0.05  # rad, m; a direction with more counts as not shown
 ALONE = 1.0 - 1e-6  # share of a turn or shift inside the shown directions that counts as all
 
@@ -92,7 +91,7 @@ class _Joint:
         self.power = moments.power()[j]
         weights = self._weights(self.power / (3.0 * self.count))
         self.frame, _ = best_frame(self.sums, weights, zero)
-        for _ in range(ROUNDS):
+        for _ in range(2):  # of weighting by what the fit leaves
             weights = self._weights(self._left_over() if given is None else 2.0 * given)
             self.frame, _ = descend(self.sums, weights, self.frame)
         clean = self.sums

@@ -21,7 +21,6 @@ from adapter.model.spatial import Array
 from adapter.physics.identifiability import RANK_TOLERANCE
 
 EDGE = 1e-6  # kg, least eigenvalue in those units of a body that noise pushes to the edge
-ROOM = 1e-2  # kg, such an eigenvalue from which on more room is worth nothing
 LIGHT = 1e-6  # kg of room that 1 kg of mass (and of its size) is worth: what is unseen stays light
 HELD = 1e-9  # weight of a body of 1 kg and radius `LENGTH`, to the mean weight of the data
 
@@ -121,7 +120,7 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
         np.zeros((count + 1, count + 1)),
         goal,
         np.vstack([in_cone, in_room]),
-        np.append(fixed, ROOM) / size,
+        np.append(fixed, 1e-2) / size,  # kg: more room is worth nothing
         in_cones,
     )
     if not np.isfinite(x).all():
