@@ -138,7 +138,12 @@ def told_of(
         found: of the search; ends: recordings by name -> s, when each ends.
         trusted: (n, 10) standard deviation of the model's inertias as they were believed.
     """
-    left = leftovers_of(found, list(ends.values()))
+    # of each joint one entry: patterns, else what happens but once
+    first_end_s = next(iter(ends.values()))
+    kept = {x.joint: x for x in _patterns_left(found, first_end_s)}
+    for leftover in (*_outbursts(found.fit), *_too_smooth(found.fit, first_end_s)):
+        kept.setdefault(leftover.joint, leftover)
+    left = tuple(kept[joint] for joint in sorted(kept))
     findings = *findings_of(found, ends), *corrected_links(found, max(ends.values()), trusted)
     return doubted(sorted(findings, key=lambda f: -f.detectability), left), left
 
@@ -218,7 +223,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
         torque = fit.model.contribution(recording, k)
         t = fit.recordings[recording].t
         on = (t >= begin) & (t < end)
-        overlaps = _overlaps(standing, named, named.candidate.joint in shifted)
+        overlaps = _overlaps(standing, named.candidate.joint in shifted)
         keys = [p.key for p in effect.parameters]
         values = {key: x for key, x in named.values.items() if key in keys}
         spread, evidence = parameter_std(fit, covariance, k), standing.probability
@@ -275,7 +280,7 @@ def _resting(spring: Finding, offset: Finding) -> Finding:
     return replace(spring, parameters=parameters, std={**spring.std, "q0": std})
 
 
-def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, float]:
+def _overlaps(standing: Standing, shifted: bool) -> dict[str, float]:
     """Other names that explain 0.9 and more of the signature, best first.
 
     `shifted`: whether an offset of the same joint was named beside it.
@@ -312,15 +317,7 @@ def noise_floor(fit: Fit) -> Array:
     return np.minimum(np.max(levels, axis=0), np.sqrt(np.mean(left**2, axis=0)))
 
 
-def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
-    """What no effect explains, one entry for each joint: patterns, else what happens but once."""
-    told = {x.joint: x for x in _patterns_left(found, ends)}
-    for leftover in (*_outbursts(found.fit), *_too_smooth(found.fit, ends)):
-        told.setdefault(leftover.joint, leftover)
-    return tuple(told[joint] for joint in sorted(told))
-
-
-def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
+def _too_smooth(fit: Fit, end_s: float) -> list[Leftover]:
     """Joints whose residual the samples before it foretell too well to be noise.
 
     Disturbances are slow too, but not by so much; memory, as hysteresis has it, is.
@@ -346,7 +343,7 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
         if size < DISCREPANCY * _idealised(fit, j):
             continue
         names = tuple(follows) or (f"q{j + 1}", "t")
-        out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, ends[0])))
+        out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, end_s)))
     return out
 
 
@@ -384,7 +381,7 @@ def doubted(findings: Sequence[Finding], leftovers: Sequence[Leftover]) -> tuple
     return tuple(out)
 
 
-def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
+def _patterns_left(found: Found, end_s: float) -> tuple[Leftover, ...]:
     """What patterns found, on each joint that is not merely its named effects' inexactness."""
     fit, out = found.fit, []
     for j in range(fit.n):
@@ -400,7 +397,7 @@ def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
         signals = [s for i in order for s in fit.named[own[i]].candidate.effect.depends_on]
         dated = (fit.named[k].interval_s for k in own)
         begin, end = next((x for x in dated if x != WHOLE), WHOLE)
-        interval = max(begin, 0.0), min(end, ends[0])
+        interval = max(begin, 0.0), min(end, end_s)
         out.append(Leftover(j + 1, rmse, floor, tuple(dict.fromkeys(signals)), interval))
     return tuple(out)
 

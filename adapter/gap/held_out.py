@@ -382,7 +382,9 @@ def _paying(task: GapTask, found: Found) -> Found:
     level = noise_floor(found.fit)
     ways = [found, uncorrected(found)]
     loaded = any(map(from_the_start, found.fit.named))  # it is weighed beside all of the rest
-    for places in (found.weak, _springs(found)) if not loaded else ():
+    # springs that any arm may have and these data do not single out
+    springs = [k for k in found.weak if found.fit.named[k].candidate.effect is SPRING]
+    for places in (found.weak, springs) if not loaded else ():
         if places:
             fewer = _without(found, places)
             ways += [fewer, uncorrected(fewer)]
@@ -393,11 +395,6 @@ def _paying(task: GapTask, found: Found) -> Found:
             break
         best = min(less, key=lambda x: x.cost)
     return best.found
-
-
-def _springs(found: Found) -> frozenset[int]:
-    """Places of springs that any arm may have and these data do not single out."""
-    return frozenset(k for k in found.weak if found.fit.named[k].candidate.effect is SPRING)
 
 
 def _without(found: Found, places: Collection[int]) -> Found:

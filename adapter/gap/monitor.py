@@ -24,7 +24,6 @@ from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, Disagreement
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.learning.change import extremes, is_new
 from adapter.learning.learner import OnlineLearner
-from adapter.learning.theta import Theta
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
@@ -187,15 +186,6 @@ class Monitor:
         squares = np.square(self._belief.mean()[own]) + np.square(self._belief.std()[own])
         return np.asarray(squares.reshape(-1, self._n))
 
-    def _unsure(self, theta: Theta, dq: Array) -> Array:
-        """(m, n) variance of what friction holds at velocities dq (m, n), (N m)².
-
-        At a rest static friction is one unknown value however many rows the rest lasts; those of
-        a second tell then as much as one.
-        """
-        held = np.square(slowness(dq)) * theta.banded(self._squares())
-        return np.where(np.abs(dq) < SMOOTHING_DQ, 1e9 / BLOCK_NS, 1.0) * held
-
     def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
         """A group is full: judge the window with it, and let the oldest group into the belief."""
         t, table = (np.array(column) for column in zip(*self._rows, strict=True))
@@ -226,7 +216,10 @@ class Monitor:
         signatures = frames.signatures(q, dq, ddq, model, Y)
         # a joint that comes to a rest or leaves one within a row rests in it
         slowest = np.maximum(np.abs(dq) - 1e-9 * BLOCK_NS * np.abs(ddq), 0.0)
-        unsure = self._unsure(learner.theta, slowest)
+        # (N m)²; at a rest static friction is one unknown value however many rows the rest lasts:
+        # those of a second tell then as much as one
+        held = np.square(slowness(slowest)) * learner.theta.banded(self._squares())
+        unsure = np.where(slowest < SMOOTHING_DQ, 1e9 / BLOCK_NS, 1.0) * held
         rates = np.hstack([dq, ddq])
         new = is_new(rates, self._rates).astype(float)
         return RowGroup(t, Z, signatures, tau - tool, unsure, rates, new)

@@ -46,8 +46,6 @@ BRISTLES = CATALOGUE["bristle_friction"]
 EVERYWHERE = (BRISTLES, OFFSET)
 SPRING = CATALOGUE["joint_spring"]
 DRIVEN = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"])
-# Of the whole arm: what its torques lack of the motion's band, and a table that is not level
-OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
 AT_ZERO = 1e-3  # N m/rad: where a spring rests is in the offset beside it
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
 
@@ -235,7 +233,7 @@ def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = (*DRIVEN
 
 
 def _as_any_arm(fit: Fit, joints: Sequence[int]) -> Fit:
-    """The same, with what the whole arm has."""
+    """The same, with what the whole arm has: a filter of its torques, a table that is not level."""
     fit = _beside(fit, joints)
-    whole = [_assumed(effect, -1) for effect in OF_THE_WHOLE]
+    whole = [_assumed(CATALOGUE[name], -1) for name in ("torque_filter", "base_tilt")]
     return fit.with_named([*fit.named, *whole])

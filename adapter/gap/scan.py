@@ -133,10 +133,12 @@ class SignatureTable:
     ) -> None:
         tables, noise = [], []
         extra = self._patterns(fit, joints) if kind == PATTERNS else []
-        extra += self._laws(fit, joints if kind != CATALOGUED else self._rivalled(fit, joints))
+        stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
+        lawful = joints if kind != CATALOGUED else self._rivalled(fit, joints)
+        extra += [way for j in lawful for way in laws(stages, j)]
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
-            table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
+            table, self.candidates = signatures(stages[i], joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
                 own, heard = fit.model.residual(i), fit.recordings[i].heard
@@ -157,10 +159,6 @@ class SignatureTable:
     def X(self) -> Array:
         """(c, r) all signatures, white."""
         return self.fit.whiten(self.tables)
-
-    def _laws(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int, Template]]:
-        stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
-        return [way for j in joints for way in laws(stages, j)]
 
     def _rivalled(self, fit: Fit, joints: Sequence[int]) -> list[int]:
         """Joints that have a law, or an effect that one may be taken for."""

@@ -140,11 +140,9 @@ class Signals:
 
     def low_of(self, make: Callable[[slice], Array]) -> Array:
         """The same of what is made stretch by stretch: at the motion's rate it may be large."""
-        parts = [self._trimmed(low(make(rows))) for rows in self.stretches]
+        parts = [low(make(rows)) for rows in self.stretches]
+        parts = [x[self.trim : len(x) - self.trim] for x in parts] if self.trim else parts
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _trimmed(self, x: Array) -> Array:
-        return x[self.trim : len(x) - self.trim] if self.trim else x
 
     def low_on(self, x: Array, joint: int) -> Array:
         """A torque (m, n) that acts on one joint (-1: on all) in the band (k, n)."""

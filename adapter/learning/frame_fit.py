@@ -23,9 +23,6 @@ from adapter.physics.freedom import Freedom
 
 # Eigenvalues of the curvature below this, relative to the largest, are rounding.
 RELATIVE_CURVATURE = 1e-10
-# Singular values of Wahba's matrix below this, relative to the largest: what shows no more than
-# one direction leaves the turn about it open.
-OPEN_ROTATION = 1e-3
 STEPS = 60  # of Gauss-Newton; from Wahba's rotation 4 are enough, from a far start 20
 SMALLEST_STEP = 1e-13  # rad, m: close to the rounding of a frame
 LONGEST_TURN = 1.0  # rad a step
@@ -152,7 +149,9 @@ def first_frames(sums: Array, weights: Array, prior: Frame) -> list[Frame]:
     best = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     if values[0] == 0.0:
         return [prior]
-    if values[1] > OPEN_ROTATION * values[0]:
+    # Singular values of Wahba's matrix below this, relative to the largest: what shows no more than
+    # one direction leaves the turn about it open.
+    if values[1] > 1e-3 * values[0]:
         return [Frame(best, prior.p.copy())]
     about = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)[:, None] * u[:, 0]  # tried about it
     return [Frame(turn @ best, prior.p.copy()) for turn in exp_rotation(about)]

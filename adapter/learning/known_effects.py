@@ -20,9 +20,6 @@ from adapter.physics.kernels import JointMotion, jit
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns, stamps_of
 
-# On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's torque:
-# 0.10 N m without smoothing, 0.01 with.
-TWIST_SMOOTHING_S = 0.03
 SMALLEST_STD = 1e-3  # of the effect's own; a model that is surer than that is not believed
 
 
@@ -54,7 +51,9 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
             # the second rate of torque is small against its noise: followed slowly
             newest = (rate[j] - memory[1, j]) / dt if clock[1] >= 2 else 0.0
             old = memory[3, j] if clock[1] >= 2 else 0.0
-            memory[3, j] = old + (newest - old) * dt / (dt + TWIST_SMOOTHING_S)
+            # On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's
+            # torque: 0.10 N m without smoothing, 0.01 with.
+            memory[3, j] = old + (newest - old) * dt / (dt + 0.03)
             jerk[j] = memory[3, j]
             memory[0, j], memory[1, j] = tau[j], rate[j]
             if clock[1] == 0:  # before it is known better, the motor pushes the way it moves

@@ -37,9 +37,6 @@ CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squar
 RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
-# Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up in
-# motion, 0.88 at most where friction turned around).
-LOAD_SHARE = 0.95
 MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
 
 
@@ -541,7 +538,9 @@ class OnlineLearner:
             return False
         begin = self.theta.hand.start
         load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
-        return explained_share(load, error / size) > LOAD_SHARE
+        # Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up
+        # in motion, 0.88 at most where friction turned around).
+        return explained_share(load, error / size) > 0.95
 
     @property
     def rates_seen(self) -> Array:

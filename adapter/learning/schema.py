@@ -56,9 +56,6 @@ PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift 
 SHOWN_EXACTLY, KNOWN_EXACTLY = 1.0, 1.6e5
 NEAR = 2.5e-3  # rad, m: from where the curvature alone finds the way, where nothing disturbs it
 SURE = 3.0  # standard deviations that may be left in directions that are not known yet
-# Times that λ has to stand still for where something shown is not known yet. Without noise that is
-# soon over, unless a brake holds a joint.
-PATIENCE = 5
 LONGEST_WAIT_NS = 50_000_000  # what counts of the time between two looks at a λ that stands still
 SETTLED_LOOK_NS = LONGEST_WAIT_NS  # between two looks at a λ that has converged
 EXACT_DISTANCE = 1e-6  # rad, m: what may be left to the optimum of motion without noise
@@ -369,7 +366,9 @@ class Schema:
         calm = 1e-9 * self._calm_ns / self.settings.stable_s
         settled = checked and calm >= 1.0 and not self._rough
         if self._exact:  # no noise hides for long what is shown
-            known = self.rank == self.ranks.sum() or calm >= PATIENCE
+            # Times that λ has to stand still for where something shown is not known yet. Without
+            # noise that is soon over, unless a brake holds a joint.
+            known = self.rank == self.ranks.sum() or calm >= 5
             settled = settled and known and bool(np.abs(self._left).max() < EXACT_DISTANCE)
         self.converged = settled
 

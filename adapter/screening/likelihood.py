@@ -152,7 +152,9 @@ class Telling:
         columns, model = self._columns(rows, changed)
         if more is not None:
             columns = np.concatenate([columns, more], axis=2)
-        (m, n), beyond = model.shape, self._beyond(rows.q)
+        (m, n), limits = model.shape, self.model.limits
+        over = np.maximum(rows.q - limits.upper, limits.lower - rows.q) > BEYOND_RAD
+        beyond = BEYOND * float((over & (limits.upper > limits.lower)).mean(axis=0).sum())
         counts = np.where(np.abs(rows.dq) < SMOOTHING_DQ, REST, 1.0)  # as roots of weights
         counts /= np.sqrt(np.mean(np.square(counts), axis=0))
         columns *= counts[:, :, None]
@@ -221,12 +223,6 @@ class Telling:
             later = (np.arange(len(model)) >= changed)[:, None, None]
             parts.append(later * regressor[:, :, -10:] * LOAD_STD)
         return np.concatenate(parts, axis=2), model
-
-    def _beyond(self, q: Array) -> float:
-        """What positions (m, n) outside the model's limits cost."""
-        low, high = self.model.limits.lower, self.model.limits.upper
-        over = (np.maximum(q - high, low - q) > BEYOND_RAD) & (high > low)
-        return BEYOND * float(over.mean(axis=0).sum())
 
 
 def by_joint(columns: Sequence[Array]) -> Array:

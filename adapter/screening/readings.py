@@ -29,9 +29,6 @@ from adapter.screening.likelihood import (
     plausible_nm,
 )
 
-DATES = tuple(
-    np.linspace(0.1, 0.9, 9)
-)  # shares of it at which the hand may take or leave something
 NUMBER = 4.0  # what a number costs that a reading takes from the recording: it was one of some ten
 CLEAR = 4.0  # standard deviations of a joint's share, from which on it tells anything
 UNITS = {
@@ -45,11 +42,6 @@ LARGE_FACTOR = 5.0  # of all torques; models are not wrong by so much, units and
 NEAR_UNIT = 3.0  # a unit so far from the size that torques have is worth trying
 SIZE_ROUNDS, LEAST_FACTOR = 4, 1.5  # of one joint's size; gains and friction explain less
 G, ASKEW_RAD = 9.81, np.deg2rad(15.0)  # m/s²; a load bends what torques say of gravity so far
-CURRENTS = (
-    "convert them with --tau-gain G1,G2,... (N m per recorded unit, one per joint or one for "
-    "all), learn the gains with --tau-gain fit, or give --gear G1,G2,... where they are torques "
-    "of the motors; --tau-gain 1 takes them as N m"
-)
 
 
 class Reading(NamedTuple):
@@ -291,7 +283,9 @@ class Readings:
         rest = f" ({', '.join(silent)}: not shown)" if silent else ""
         said = (
             f"effort of {which} looks like motor current: {times} times too {word} for any arm of "
-            f"this model{rest}; {CURRENTS}"
+            f"this model{rest}; convert them with --tau-gain G1,G2,... (N m per recorded unit, one "
+            "per joint or one for all), learn the gains with --tau-gain fit, or give --gear "
+            "G1,G2,... where they are torques of the motors; --tau-gain 1 takes them as N m"
         )
         yield Reading("scale", said, _divided(self.rows, share.factor), len(telling))
 
@@ -341,7 +335,7 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
 
 def other_hand(rows: Rows, telling: Telling) -> Explained:
     """How well the model explains rows where the hand takes or leaves something half way."""
-    dates = (np.array(DATES) * len(rows.q)).astype(int).tolist()
+    dates = (np.linspace(0.1, 0.9, 9) * len(rows.q)).astype(int).tolist()
     return min((telling.explained(rows, date) for date in dates), key=lambda x: x.cost)
 
 

@@ -495,9 +495,8 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     """
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
     behind = pauses(stamps_s)
-    stamps_s[1:] -= np.cumsum(
-        np.maximum(np.diff(stamps_s) - 1.0, 0.0)  # what is left of a longer pause
-    )  # a clock that steps on by hours
+    # a second is left of a longer pause: a clock may step on by hours
+    stamps_s[1:] -= np.cumsum(np.maximum(np.diff(stamps_s) - 1.0, 0.0))
     signals = smooth(stamps_s, log.q, log.dq, log.tau)
     t, clear = GRID_S * np.arange(len(signals[0])), np.ones(len(signals[0]), dtype=bool)
     for k in behind:

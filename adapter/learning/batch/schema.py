@@ -24,10 +24,6 @@ from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array, zxz_from_matrix
 from adapter.physics.freedom import Freedom
 
-# No weight looks below this share of a signal's power (1e-7 of its size): rounding of moments.
-RESIDUAL_FLOOR = 1e-14
-# Noise alone makes curvature of the size of the square root of the count (schema learner).
-NOISE_CURVATURE = 10.0
 LARGEST_STD = 0.05  # rad, m; a direction with more counts as not shown
 ALONE = 1.0 - 1e-6  # share of a turn or shift inside the shown directions that counts as all
 
@@ -107,14 +103,17 @@ class _Joint:
 
     def _weights(self, variance: Array) -> Array:
         """1 / variance by channel; a channel without signal or measurement weighs nothing."""
-        floor = RESIDUAL_FLOOR * self.power / (3.0 * self.count)
+        # No weight looks below this share of a signal's power (1e-7 of its size): rounding of
+        # moments.
+        floor = 1e-14 * self.power / (3.0 * self.count)
         some = self.used & (self.power > 0.0)
         return np.where(some, 1.0 / np.where(some, np.maximum(variance, floor), 1.0), 0.0)
 
     def _judge(self, clean: Array, weights: Array) -> None:
         """Directions that count as shown, and the spread inside them, in the parent's axes."""
         values, vectors = curvature_in_parent(clean, weights, self.frame)
-        least = max(LARGEST_STD**-2, NOISE_CURVATURE * np.sqrt(self.count))
+        # Noise alone makes curvature of the size of the square root of the count (schema learner).
+        least = max(LARGEST_STD**-2, 10.0 * np.sqrt(self.count))
         shown = values > max(least, RELATIVE_CURVATURE * float(values[-1]))
         kept = vectors[:, shown]
         self.shown = kept @ kept.T
