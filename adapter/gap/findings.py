@@ -22,9 +22,9 @@ from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
+from adapter.screening.readings import rms
 
 OFFSET, SPRING = "torque_offset", "joint_spring"
-OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
 ODD = 4.0  # standard deviations from which on a correction is a finding
 DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
@@ -307,7 +307,7 @@ def _is_open(standing: Standing, rival: Rival, shifted: bool) -> bool:
     nested = mine.form in dict(other.simpler) or other.form in dict(mine.simpler)
     if not nested or (shifted and other.form == TWO_LEVELS):
         return True
-    return rival.log_evidence > standing.log_evidence - OPEN_NATS
+    return rival.log_evidence > standing.log_evidence - 3.0  # nats: it is open
 
 
 def noise_floor(fit: Fit) -> Array:
@@ -332,14 +332,14 @@ def _too_smooth(fit: Fit, end_s: float) -> list[Leftover]:
         if throughout.sum() < FEW_ROWS:
             continue
         before, now = lagged[throughout, :-1], lagged[throughout, -1]
-        surprise = _rms(now - before @ np.linalg.lstsq(before, now, rcond=None)[0])
+        surprise = rms(now - before @ np.linalg.lstsq(before, now, rcond=None)[0])
         if level[j] < SMOOTH * surprise:
             continue
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
         on = slides[:, j]
         shares = {name: explained(residual[on, j], x[on]) for name, x in signals.items()}
         follows = sorted((x for x in shares if shares[x] > FOLLOWS), key=lambda x: -shares[x])
-        size = _rms(residual[on, j])
+        size = rms(residual[on, j])
         if size < DISCREPANCY * _idealised(fit, j):
             continue
         names = tuple(follows) or (f"q{j + 1}", "t")
@@ -357,7 +357,7 @@ def _outbursts(fit: Fit) -> list[Leftover]:
     for j in range(fit.n):
         rows = counted[:, j]
         spans = [w for w in np.unique(window[rows]) if np.sum(rows & (window == w)) >= FEW_ROWS]
-        sizes = [_rms(residual[rows & (window == w), j]) for w in spans]
+        sizes = [rms(residual[rows & (window == w), j]) for w in spans]
         if len(sizes) < FEW_SPANS:
             continue
         usual, worst = float(np.median(sizes)), int(np.argmax(sizes))
@@ -390,8 +390,8 @@ def _patterns_left(found: Found, end_s: float) -> tuple[Leftover, ...]:
             continue
         parts = [fit.model.contribution(0, k)[:, j] for k in own]
         left, pattern = fit.model.residual(0)[:, j], np.sum(parts, axis=0)
-        floor, rmse = _rms(left), _rms(left + pattern)
-        if rmse < VISIBLE * floor or _rms(pattern) < DISCREPANCY * _idealised(fit, j):
+        floor, rmse = rms(left), rms(left + pattern)
+        if rmse < VISIBLE * floor or rms(pattern) < DISCREPANCY * _idealised(fit, j):
             continue
         order = np.argsort([-np.mean(part**2) for part in parts])
         signals = [s for i in order for s in fit.named[own[i]].candidate.effect.depends_on]
@@ -406,16 +406,12 @@ def _idealised(fit: Fit, joint: int) -> float:
     """Torque on a joint (from 0) of the largest named effect that is an idealisation, N m rms."""
     return max(
         (
-            _rms(fit.model.contribution(e.recording or 0, k)[:, joint])
+            rms(fit.model.contribution(e.recording or 0, k)[:, joint])
             for k, e in enumerate(fit.named)
             if e.candidate.effect.inexact
         ),
         default=0.0,
     )
-
-
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 BINS = 12
@@ -433,7 +429,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> tuple[dict[str, Any],
     out = []
     for j in range(curves.before.shape[1]):
         residual = curves.before[:, j]
-        rmse = _rms(residual)
+        rmse = rms(residual)
         signals = {f"{name}{j + 1}": getattr(curves, name)[:, j] for name in SIGNALS}
         signals["t"] = curves.t
         shares = {name: explained(residual, x) for name, x in signals.items()}

@@ -29,13 +29,11 @@ from adapter.model.spatial import Array
 
 TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
-EDGE = 0.3  # of a jump of added torque: friction turns round more softly than its equation
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
 WIDER = 2.0  # than what any arm has: what may have a name beside it
-MOST_FITTED = 0.5  # of independent rows that coefficients may have taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,7 +378,7 @@ class Fit:
         parts = zip(self.recordings, self.own_noise(), self.weights, strict=True)
         for (own, noise, weight), share in zip(parts, np.split(shares, ends), strict=True):
             rows = np.maximum(np.sum(own.sliding * weight**2, axis=0) / noise.memory, 1.0)
-            fitted = np.minimum(share.reshape(own.tau.shape).sum(axis=0) / rows, MOST_FITTED)
+            fitted = np.minimum(share.reshape(own.tau.shape).sum(axis=0) / rows, 0.5)  # at most
             out.append(replace(noise, level=noise.level / np.sqrt(1.0 - fitted)))
         return tuple(out)
 
@@ -439,7 +437,7 @@ def unsure(model: Model, recording: int, place: int) -> Array:
     jumps = maximum_filter1d(torque, size, axis=0, origin=shift)
     jumps -= minimum_filter1d(torque, size, axis=0, origin=shift)
     band = effect.band * np.abs(torque).max(axis=0) * own.slowness
-    edge = EDGE if isinstance(effect, TorqueEffect) else 0.0
+    edge = 0.3 if isinstance(effect, TorqueEffect) else 0.0  # friction turns more softly
     return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, edge * jumps)))
 
 

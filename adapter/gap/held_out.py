@@ -33,7 +33,6 @@ from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
 from adapter.signals.validation import smooth
 from adapter.simulate import DrivenMotion, Simulate
 
-NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
@@ -427,7 +426,7 @@ def uncorrected(found: Found) -> Found:
     What is known of the coefficients stays what is known with the inertias free within their
     prior: that they are left alone does not make them any surer.
     """
-    fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
+    fit, carried = refitted(replace(found.fit, prior=1e-4 * found.fit.prior))  # next to none
     model = replace(fit.model, dtheta=np.zeros_like(fit.dtheta))
     kept = replace(fit, model=model, prior=found.fit.prior)
     return replace(found, fit=kept, carried=carried, known=kept.carried(), under=fit)

@@ -16,7 +16,6 @@ from adapter.gap.result import UNEXPLAINED
 from adapter.model.spatial import Array
 
 GROUPS = 10  # in the window, 0.2 s each
-MARGIN = 3.0  # log evidence by which the best name leads when it is told at once
 LATEST_S = 1.4  # after its start the best name is told even if another is close
 OVER_THRESHOLD = 10.0
 OVER_SHARE = 0.7  # of the best new name's evidence, which has more freedom around the edge
@@ -136,7 +135,7 @@ class DisagreementDetector:
         best = self._all.evidence(G, b)[:, 0]
         order = np.argsort(-best)
         which = int(order[0])
-        close = [self._candidates[k] for k in order[1:4] if best[k] > best[which] - MARGIN]
+        close = [self._candidates[k] for k in order[1:4] if best[k] > best[which] - 3.0]  # nats
         if close and may_wait:
             return
         candidate = self._candidates[which]

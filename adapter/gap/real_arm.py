@@ -46,7 +46,6 @@ BRISTLES = CATALOGUE["bristle_friction"]
 EVERYWHERE = (BRISTLES, OFFSET)
 SPRING = CATALOGUE["joint_spring"]
 DRIVEN = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"])
-AT_ZERO = 1e-3  # N m/rad: where a spring rests is in the offset beside it
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
 
 
@@ -216,7 +215,7 @@ def _assumed(effect: Effect, joint: int) -> Named:
     """An effect that any arm has, of its usual size (`priors`, or as its template says)."""
     template = effect.templates()[1 if effect is BRISTLES else 0]  # bristles of a Panda
     if effect.name in EFFECT_STD:
-        std = EFFECT_STD[effect.name], *[AT_ZERO] * (len(template.prior_std) - 1)
+        std = EFFECT_STD[effect.name], *[1e-3] * (len(template.prior_std) - 1)  # N m/rad
         template = replace(template, prior_std=std)
     return replace(_named(effect, template, joint), assumed=True)
 

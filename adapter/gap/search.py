@@ -48,7 +48,6 @@ FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction 
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
 FALLS_CHI2 = 4.0  # that friction which falls with the speed must say more to be looked at closely
 RESOLVED_CHI2 = 4.0  # that bristles must be better than friction that slides at once
-SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
 
@@ -175,7 +174,7 @@ def _round(
         if trial is not None:
             taken = {move.joint, -1}  # plain moves of other joints do not touch this one
             for other in moves:
-                if other.joint in taken or other.log_evidence < BELIEF + SURE_NATS:
+                if other.joint in taken or other.log_evidence < BELIEF + 20.0:  # or less sure
                     continue
                 taken.add(other.joint)  # the best move of a joint decides, whatever it is
                 if other.plain:

@@ -38,10 +38,8 @@ DECIMATION = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
 TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
-BAND_MARGIN = 1.3  # of a torque's band, over where it no longer stands out of noise
 CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at least
 LEAST_S = 1.2  # of a recording, and of a stretch between pauses
-HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
@@ -60,7 +58,6 @@ SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; comp
 SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
 UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
 FAR_S = 0.05  # a command older than that does not drive any more
-HOLE_S = 0.05  # between samples: what happened in there is not known
 ROLLOUT_EDGE_S = 0.3
 
 
@@ -239,7 +236,7 @@ def in_band(motion: Motion, noise: Array, tau: Array, known: Array, trim: int = 
     if motion.bands_hz is None:
         motion = replace(motion, bands_hz=bands_of(motion, noise))
     at = slice(TAPS // 2, -(TAPS // 2), DECIMATION)
-    heard = (minimum_filter1d(known, TAPS, axis=0)[at] > HEARD).astype(float)
+    heard = (minimum_filter1d(known, TAPS, axis=0)[at] > 0.999).astype(float)  # all of it
     own, t, heard = (x[trim : len(x) - trim] for x in (low(tau), motion.t[at], heard))
     return Signals(motion, noise, own, t, heard, trim=trim)
 
@@ -276,7 +273,7 @@ def bands_of(motion: Motion, noise: Array) -> Array:
     clear = np.cumsum(power[::-1], axis=0)[::-1] > CLEAR * theirs
     clear &= (f <= f[-1] - TOP_HZ)[:, None]
     last = len(f) - 1 - np.argmax(clear[::-1], axis=0)
-    band = np.where(f[last] + 2.0 * f[1] > f[-1] - TOP_HZ, math.inf, BAND_MARGIN * f[last])
+    band = np.where(f[last] + 2.0 * f[1] > f[-1] - TOP_HZ, math.inf, 1.3 * f[last])  # a margin
     return np.where(clear.any(axis=0), band, 0.0)
 
 
@@ -404,7 +401,7 @@ class Recorded:
         """Whether there are samples all the way between two of its times."""
         first, last = np.searchsorted(self.t, (begin_s, end_s))
         around = self.t[max(first - 1, 0) : last + 1]
-        return bool(len(around) > 1 and np.diff(around).max() < HOLE_S)
+        return bool(len(around) > 1 and np.diff(around).max() < 0.05)  # no hole in between
 
     def drive(self, t: Array) -> tuple[Array, str]:
         """Torque (m, n) that moved the arm at times t, and which of `COMMANDS`, `MEASURED` it is.

@@ -32,7 +32,6 @@ from adapter.model.tree import BASE, Tree
 # sensor's place (m), biases (rad/s, m/s²) and the lateness of its stamps (s).
 FRAME_STD, PLACE_STD, W_BIAS_STD, A_BIAS_STD, LATE_STD = 0.3, 1.0, 0.1, 1.0, 0.05
 OWN = 13  # unknowns of a sensor: turn, place, biases of w and a, lateness
-MAINLY = 0.3  # of a gauge's step; a frame that it moves by more is said not to be known along it
 LEAST_STD = 1e-9  # rad/s, m/s²: no sensor is trusted more
 WILD = 6.0  # standard deviations; a window that is further off is not believed
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0
@@ -417,7 +416,7 @@ def told_apart(tree: Tree, gravity: Array, at: Estimate) -> list[Array]:
     for j in range(tree.n):
         hidden = np.zeros((6, 2))
         hidden[2, 0], hidden[3:, 1] = 1.0, at.R0[j, :, 2]
-        mainly = gauge[j][:, np.linalg.norm(gauge[j], axis=0) > MAINLY]
+        mainly = gauge[j][:, np.linalg.norm(gauge[j], axis=0) > 0.3]  # a step moves it so far
         whole, _ = np.linalg.qr(np.concatenate([hidden, mainly], axis=1), mode="complete")
         found.append(whole[:, 2 + mainly.shape[1] :])
     return found

@@ -20,8 +20,6 @@ from adapter.physics.kernels import JointMotion, jit
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns, stamps_of
 
-SMALLEST_STD = 1e-3  # of the effect's own; a model that is surer than that is not believed
-
 
 @jit
 def to_joints(stamps, table, sensors, gears, clock, memory):
@@ -105,7 +103,7 @@ def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Arr
             std = active.std.get(effect.key) if effect is active.effect else None
             widest = effect.learned_std
             known_to = None if std is None or not np.isfinite(std) else float(std)
-            spread = widest if known_to is None else max(known_to, SMALLEST_STD * widest)
+            spread = widest if known_to is None else max(known_to, 1e-3 * widest)  # not surer
             total[at] += value
             variance[at] = np.nan_to_num(variance[at]) + spread**2
     told = np.isfinite(variance)
@@ -139,12 +137,10 @@ class KnownEffects:
         n = arm.n
         self._layout, self._arm, self._smoothing_s = StateLayout(n), arm, smoothing_s
         self._own = own = by_joint(effects, n)
-        self._sensors = own.half_play, own.gain, own.delay_s
         self._gears = Gears.of(own)
         turned = own.offset.any() or own.ripple.any()
         self._encoders = self._gears._replace(compliance=np.zeros(n)) if turned else None
         self._sensed = own.moves or bool(own.gain.any() or own.delay_s.any())
-        self._by_load = own.by_load
         self.clock, self.memory = np.zeros(2, dtype=np.int64), np.zeros((4, n))
         self.left_out = own.left_out
         self.take_off(self._layout.new(1))  # compiled now, not at the first state
@@ -160,12 +156,13 @@ class KnownEffects:
         table = table.copy()
         if self._sensed:
             stamps = stamps_of(table)
-            to_joints(stamps, table, self._sensors, self._gears, self.clock, self.memory)
+            sensors = own.half_play, own.gain, own.delay_s
+            to_joints(stamps, table, sensors, self._gears, self.clock, self.memory)
         q, tau = table[:, at.q], table[:, at.tau]
         if own.pushed:
             tau += self._arm.wrench_torque(q, own.wrench)
         signals = at.signals(table, self._smoothing_s)
-        if self._by_load:
+        if own.by_load:
             signals = signals._replace(tau=tau - own.torque(signals))
         if own.laws:
             tau -= own.torque(signals)

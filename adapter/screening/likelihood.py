@@ -26,7 +26,6 @@ FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # where the search for the noise begins: N m,
 INERTIA_SHARE, RADIUS_M = 0.4, 0.1  # plausible error of masses; of where they sit
 LOAD_STD = np.repeat((3.0, 0.3, 0.05), (1, 3, 6))  # kg, kg m, kg m2
 FRICTION = (1.0, 4.0, 4.0, 0.1)  # std of offset, Coulomb, viscous (N m, N m, N m s/rad), gain
-TILT_STD_RAD = np.deg2rad(5.0)  # of a base: what stands on a wall is read as such
 SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque went through
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
@@ -136,7 +135,7 @@ class Telling:
         """How well rows are explained on a base that stands askew, and gravity (3,) in its axes."""
         arm, still = self.arm, np.zeros_like(rows.q)
         size = float(np.linalg.norm(arm.gravity))
-        aside = size * TILT_STD_RAD * np.linalg.svd(arm.gravity[None])[2][1:]
+        aside = size * np.deg2rad(5.0) * np.linalg.svd(arm.gravity[None])[2][1:]  # of a base
         bodies = arm.theta
         for _ in range(2):  # what the hand holds is askew as well
             tilts = [arm.changed(bodies, x).torque(rows.q, still, still) for x in aside]

@@ -30,7 +30,6 @@ from adapter.screening.likelihood import (
 )
 
 NUMBER = 4.0  # what a number costs that a reading takes from the recording: it was one of some ten
-CLEAR = 4.0  # standard deviations of a joint's share, from which on it tells anything
 UNITS = {
     1000.0: "N mm",
     100.0: "N cm",
@@ -38,7 +37,6 @@ UNITS = {
     0.01: "torque of the motors before gears of 1:100",
     0.001: "kN m",
 }
-LARGE_FACTOR = 5.0  # of all torques; models are not wrong by so much, units and drives' gains are
 NEAR_UNIT = 3.0  # a unit so far from the size that torques have is worth trying
 SIZE_ROUNDS, LEAST_FACTOR = 4, 1.5  # of one joint's size; gains and friction explain less
 G, ASKEW_RAD = 9.81, np.deg2rad(15.0)  # m/s²; a load bends what torques say of gravity so far
@@ -103,7 +101,7 @@ def torque_shares(rows: Rows, telling: Telling) -> TorqueShares:
             left = np.mean((rows.tau[:, j] - columns @ x) ** 2)
             share[j] = x[3]
             std[j] = np.sqrt(left * inverse[3, 3] * m / min(telling.samples, m))
-    return TorqueShares(share, std, CLEAR * std < np.abs(share))
+    return TorqueShares(share, std, 4.0 * std < np.abs(share))  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -262,7 +260,7 @@ class Readings:
         """All torques in another unit: a known one, or each joint its own (motor currents)."""
         share, n = self.shares, len(self.names)
         common = float(np.median(np.abs(share.factor)))
-        if not share.tells.any() or abs(np.log(common)) < np.log(LARGE_FACTOR):
+        if not share.tells.any() or abs(np.log(common)) < np.log(5.0):  # no model is so wrong
             return
         near = {u: w for u, w in UNITS.items() if abs(np.log(u / common)) < np.log(NEAR_UNIT)}
         for (size, name), sign in [(x, s) for x in near.items() for s in (1.0, -1.0)]:

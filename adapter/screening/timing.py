@@ -14,15 +14,10 @@ from scipy.signal import butter, sosfiltfilt
 from adapter.model.spatial import Array
 
 HOLE_PERIODS = 3.0  # a step longer than so many median periods is a hole
-FROZEN_PERIODS = 10  # so many identical samples in a row are a stuck source, not a repeat
-AROUND = 5  # samples, of which the middle one tells where a reading should be
 # A reading further from it than so many usual ones, and than this share of its range, is no arm's.
 SPIKE_TIMES, SPIKE_SHARE = 15.0, 0.2
 PUT_BACK_S = 1.0  # of a pause where a clock was put back, which says nothing of how long it took
-WRAP_RAD = 0.5  # between two samples; a step so near a whole turn is none
-FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
 CUT_HZ = 8.0  # band in which velocity and position are compared: arms move below it
-MOVES_DQ = 0.02  # rad/s; slower is noise
 FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
 TIMING_SHARE = 0.25  # of a sample period: a hold of half a sample, two of these, is no effect
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
@@ -217,7 +212,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         rate_hz=1.0 / period_s if period_s else 0.0,
         jitter_s=float(np.std(regular)) if len(regular) else 0.0,
         holes=tuple((float(since_s[increasing[k]]), float(steps_s[k])) for k in gaps),
-        frozen=_runs(again & (np.abs(dq[1:]).max(axis=1) > FROZEN_DQ), since_s),
+        frozen=_runs(again & (np.abs(dq[1:]).max(axis=1) > 0.05), since_s),  # rad/s: it moves
         repeated=float(again.sum()) / max(m, 1),
         held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
         out_of_order=m - len(increasing),
@@ -253,7 +248,7 @@ def unwrapped(q: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.i
         lower, upper: (n,) rad, limits; of all turns that one is taken which lies nearest to them.
     """
     step = np.nan_to_num(np.diff(q, axis=0))
-    turns = np.where(np.abs(np.abs(step) - 2.0 * np.pi) < WRAP_RAD, np.sign(step), 0.0)
+    turns = np.where(np.abs(np.abs(step) - 2.0 * np.pi) < 0.5, np.sign(step), 0.0)  # so near a turn
     joints = np.flatnonzero(turns.any(axis=0))
     if not joints.size:
         return q, joints
@@ -295,7 +290,7 @@ def possible(q: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
         return np.ones(len(tau), dtype=bool)
     good = ~unsaid(tau)
     for x in (q, dq, tau) if good.any() else ():
-        apart = np.abs(x - median_filter(x, size=(AROUND, 1), mode="nearest"))
+        apart = np.abs(x - median_filter(x, size=(5, 1), mode="nearest"))  # samples
         low, high = np.percentile(x[good], (1, 99), axis=0)
         usual = np.median(apart[good], axis=0)
         good &= (apart <= np.maximum(SPIKE_TIMES * usual, SPIKE_SHARE * (high - low))).all(axis=1)
@@ -343,7 +338,7 @@ def _increasing(stamp_ns: Index) -> Index:
 def _runs(again: NDArray[np.bool_], since_s: Array) -> tuple[tuple[float, float], ...]:
     """(start, length) s of long runs of repeats."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], again, [False]]).astype(int)))
-    runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= FROZEN_PERIODS]
+    runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= 10]  # a stuck source
     return tuple((float(since_s[a]), float(since_s[b] - since_s[a])) for a, b in runs)
 
 
@@ -401,7 +396,7 @@ def _fit(rate: Array, dq: Array, step_s: float, pick: Index) -> tuple[float, flo
     blocks = np.array_split(np.arange(len(pick)), BLOCKS)
     xx = np.array([np.einsum("tji,tjk->jik", x[b], x[b]) for b in blocks])
     xy = np.array([np.einsum("tji,tj->ji", x[b], y[b]) for b in blocks])
-    moves = np.std(rate[pick], axis=0) > MOVES_DQ
+    moves = np.std(rate[pick], axis=0) > 0.02  # rad/s; slower is noise
     gain = np.where(moves, 0.0, np.nan)
     moves &= np.std(y, axis=0) > 0.0
     if not moves.any():

@@ -24,9 +24,6 @@ from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array, zxz_from_matrix
 from adapter.physics.freedom import Freedom
 
-LARGEST_STD = 0.05  # rad, m; a direction with more counts as not shown
-ALONE = 1.0 - 1e-6  # share of a turn or shift inside the shown directions that counts as all
-
 
 @dataclass(frozen=True)
 class SchemaResult:
@@ -69,7 +66,7 @@ def schema_from_moments(data: TreeData, noise: Array | None = None) -> SchemaRes
     return SchemaResult(
         lam=np.stack([np.r_[zxz_from_matrix(x.frame.R0), x.frame.p] for x in joints]),
         std=np.stack([joint.std for joint in joints]),
-        observable=np.diagonal(shown, axis1=1, axis2=2) > ALONE,
+        observable=np.diagonal(shown, axis1=1, axis2=2) > 1.0 - 1e-6,  # but for rounding
         freedom=Freedom.of(np.eye(6) - shown, np.stack([x.frame.p for x in joints])),
         ranks=tuple(round(float(np.trace(p))) for p in shown),
     )
@@ -113,7 +110,7 @@ class _Joint:
         """Directions that count as shown, and the spread inside them, in the parent's axes."""
         values, vectors = curvature_in_parent(clean, weights, self.frame)
         # Noise alone makes curvature of the size of the square root of the count (schema learner).
-        least = max(LARGEST_STD**-2, 10.0 * np.sqrt(self.count))
+        least = max(0.05**-2, 10.0 * np.sqrt(self.count))  # 0.05 rad or m: more is not shown
         shown = values > max(least, RELATIVE_CURVATURE * float(values[-1]))
         kept = vectors[:, shown]
         self.shown = kept @ kept.T
