@@ -20,7 +20,6 @@ from adapter.runs.terminal import say
 from drivers.interface import Driver
 
 PLAN_PAGE = "plan.html"
-MOST_READS = 200  # at once
 
 
 def need_somebody(agreed: bool) -> None:
@@ -40,7 +39,7 @@ def reading(driver: Driver) -> Callable[[], None]:
         now_ns = time.monotonic_ns()
         count = (now_ns - taken_ns[0]) // driver.period_ns if taken_ns[0] and driver.paced else 1
         taken_ns[0] = now_ns
-        for _ in range(min(count, MOST_READS)):
+        for _ in range(min(count, 200)):  # at once
             driver.read()
             if driver.arrived_ns >= now_ns:  # it had to be waited for: no more is there
                 return

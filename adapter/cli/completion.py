@@ -12,7 +12,6 @@ from adapter.model.robot_names import robot_names
 from adapter.shadowed import own_name
 
 SHELLS = ("bash", "zsh", "fish")
-ASKED = "_ARGCOMPLETE"  # the shell sets it where a command line is to be completed
 # Options whose names another room knows: where they are, loaded when one is asked for.
 NAMES_OF = {
     "effects": ("adapter.effects.catalogue", "LEARNED"),
@@ -38,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
 def complete(parser: argparse.ArgumentParser) -> None:
     """Answer a shell that asks for completions, and end; else do nothing at all."""
-    if ASKED not in os.environ:
+    if "_ARGCOMPLETE" not in os.environ:  # a shell sets it to have a line completed
         return
     subparsers = (x for x in parser._actions if isinstance(x, argparse._SubParsersAction))
     for part in (parser, *(part for action in subparsers for part in action.choices.values())):

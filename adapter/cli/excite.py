@@ -36,7 +36,6 @@ from drivers.files.mcap.writer import McapWriter, to_json
 
 TABLE, COMPARED = 300, 3  # instants of a path that are judged, random motions beside
 TENTH = 0.1  # of a period, between two durations that are looked at
-WORST = 8  # parameters that are shown
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ def _told(
         f"motion's {condition:.0f}.",
     ]
     ratio = np.where(expected.shown, expected.std / expected.wanted, 0.0)
-    for k in np.argsort(-ratio)[:WORST]:
+    for k in np.argsort(-ratio)[:8]:  # parameters that are shown
         std, unit = expected.std[k], expected.units[k]
         lines.append(f"  {expected.names[k]:28} +- {std:.2g} {unit} ({ratio[k]:.0%} of the wanted)")
     return lines

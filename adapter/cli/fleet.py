@@ -29,8 +29,6 @@ from adapter.runs.fleet import fleet
 from adapter.runs.fleet.arm import FleetArm
 from adapter.runs.terminal import console, output, results_folder, say, show, warn, write_json
 
-MOST_ROWS = 40  # on the terminal; of more recordings those that there is something to say of
-
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
@@ -131,7 +129,7 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
 
 
 def _print(arm: FleetArm) -> None:
-    shown = to_be_shown(arm, MOST_ROWS)
+    shown = to_be_shown(arm, 40)  # of more, those that there is something to say of
     table = Table(box=None, pad_edge=False, title=arm.name, title_justify="left")
     for number, head in enumerate(HEADS):
         table.add_column(head, no_wrap=number > 0, overflow="fold")

@@ -21,7 +21,6 @@ from drivers.files.names import RECORDINGS, is_recording
 
 MODES = ("moments", "sample")  # of `adapter.learning.learner`
 NAMES = "adapter.cli.names"  # brings NumPy; loaded by name where there is a name to look up
-MODEL_FILES = (".urdf", ".xml", ".json")
 
 
 def declaring(
@@ -138,7 +137,7 @@ def check_robot(name: str | None) -> None:
     if Path(name).suffix.lower() == ".xacro":
         urdf = f"{name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"
         raise UsageError(f"{name}: is xacro; make a URDF of it: xacro {name} > {urdf}")
-    if Path(name).suffix.lower() not in MODEL_FILES:
+    if Path(name).suffix.lower() not in (".urdf", ".xml", ".json"):
         raise UsageError(f"no robot '{name}'; {choices(name, robot_names(), ROBOT_FILES)}")
     check_files(Path(name))
 

@@ -17,8 +17,6 @@ from adapter.report.next_steps import Step, command, without
 from adapter.report.plan_page import Plan
 from adapter.runs.terminal import results_folder, say, show
 
-READS = 200  # among which every joint has to be measured
-
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
@@ -28,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     driver = asked.open(args.driver, False)
     driver.connect()
     try:
-        for _ in range(READS):  # the first with the position of every joint, else the last one
+        for _ in range(200):  # the first with the position of every joint, else the last one
             sample = driver.read()
             if np.isfinite(sample.q).all() and np.isfinite(sample.tau).all():
                 break

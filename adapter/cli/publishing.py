@@ -32,7 +32,6 @@ from drivers.ros2.settings import Ros2Settings, parse
 from drivers.ros2.wire import Network, Publication
 
 PREFIX = "/panda_adapter"
-PERIOD_S = 0.05
 GLOBAL = (TF_MOVING, TF_FIXED)
 
 
@@ -41,7 +40,7 @@ def publisher_job(address: str, robot: SelfModel, effects: tuple[str, ...]) -> D
     if split_address(address)[0] != "ros2":
         return None
     make = partial(Publisher, parse(address), ShownArm.of(robot), effects)
-    return DisplayJob(make, period_s=PERIOD_S, idle=True)
+    return DisplayJob(make, period_s=0.05, idle=True)
 
 
 def together(jobs: Sequence[DisplayJob | None]) -> DisplayJob | None:

@@ -167,7 +167,11 @@ def run(args: argparse.Namespace) -> int:
     if plan.maybe_real and _may_move(args):
         need_somebody(args.yes)
     folder = results_folder(args.out, "run")
-    truth = args.truth or _write_truth(plan.world, folder)
+    truth = args.truth
+    if truth is None and plan.world is not None:
+        plan.world.scenario.write_truth(folder / "truth.json")
+        # errors are against it where a scenario was asked for
+        truth = folder / "truth.json" if plan.world.asked_for else None
     reference = reference_from(truth, robot)
     driver = plan.open(args.driver, _may_move(args))
     if args.fault is not None:
@@ -203,15 +207,6 @@ def _accounts(result: LiveResult) -> list[str]:
     """How long things took, and what became of commands."""
     commands = result.intake.commands
     return result.timing.lines() + ([] if commands is None else [commands.line()])
-
-
-def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
-    """Write the scenario's truth; errors are against it where a scenario was asked for."""
-    if world is None:
-        return None
-    path = folder / "truth.json"
-    world.scenario.write_truth(path)
-    return path if world.asked_for else None
 
 
 def controller_of(

@@ -13,7 +13,6 @@ from adapter.model.robot_names import robot_names
 from drivers.errors import choices
 from drivers.registry import OWN_KIND, SCHEMES, is_own, split_address, tells_no_robot
 
-FEEDFORWARD = ("none", "documented", "learned")
 SIMULATED = ("panda",)
 ANY = -1  # the usual port, or any other where that is taken
 DEFAULT_PORT, MOST_PORT = 8765, 65535  # of Foxglove; of all
@@ -62,7 +61,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="KEY=VALUE")
     add("--passive", action="store_true", help="only listen; do not move the arm")
     add("--fault", metavar="LIST", help="inject faults into the samples, as in lost=0.01,nan=0.001")
-    add("--feedforward", choices=FEEDFORWARD)
+    add("--feedforward", choices=("none", "documented", "learned"))
     add("--view", nargs="?", type=_port, const=ANY, metavar="PORT")
     add("--foxglove", nargs="?", type=_port, const=DEFAULT_PORT, metavar="PORT")
     add("--record", type=Path, metavar="FILE", help="default: in the results")

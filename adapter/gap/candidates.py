@@ -42,8 +42,6 @@ from adapter.gap.signals import Signals, regressor_of
 from adapter.model.spatial import Array
 
 PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
-ALONE_NATS = 4.0  # signals of one bus are late together, not one joint's alone
-ALWAYS_NATS = 60.0  # what pushes for a whole recording is rather weight or a tilted base
 STEP = 0.02  # of a coefficient's typical size, for the differences
 
 
@@ -253,8 +251,6 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
 
 
 SLOW_PIECES = 10  # over time
-LEAST_RMS = 1e-6
-LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
 LINE_HZ = (0.15, 9.0)
 SHARPENED, FINE = 12, 40  # rounds in which a line's frequency is sharpened; steps either way
 
@@ -328,7 +324,7 @@ def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]
         tried = [low + share * (high - low) for share in setting.tried] if setting else [1.0]
         for template in map(law.at, tried):
             rms = np.sqrt(np.mean([_power(at, law, template, joint) for at in stages]))
-            std = CURVE_NM / max(float(rms), LEAST_RMS)
+            std = CURVE_NM / max(float(rms), 1e-6)
             scaled = (std,) * len(template.prior_std)
             out.append((law, joint, replace(template, prior_std=scaled)))
     return out
@@ -370,7 +366,7 @@ def line_hz(residual: Array, rate_hz: float) -> float | None:
     inside = (f > LINE_HZ[0]) & (f < LINE_HZ[1])
     peak = int(np.argmax(np.where(inside, power, 0.0)))
     near = power[max(peak - 20, 1) : peak + 20]
-    if power[peak] < LINE_RATIO * np.median(near):
+    if power[peak] < 30.0 * np.median(near):  # a spectral line must stand out so much
         return None
     # the top of the parabola through the peak's logarithms
     a, b, c = np.log(power[peak - 1 : peak + 2] + 1e-300)
@@ -428,7 +424,7 @@ def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     """ln of what a candidate is worth before the data, the ways to look for it included."""
     odds = c.log_odds
     if c.effect.passing and not passing:
-        odds -= ALWAYS_NATS
+        odds -= 60.0  # what pushes for a whole recording is rather weight or a tilted base
     if timed or passing:
         odds += c.effect.log_odds_of_start
     return float(odds)
@@ -440,5 +436,5 @@ def prior_log_odds(effect: Effect, joint: int, n: int, ways: int) -> float:
     if joint >= 0:
         odds -= np.log(n)
         if effect.scope == ALL:
-            odds -= ALONE_NATS
+            odds -= 4.0  # signals of one bus are late together, not one joint's alone
     return float(odds)

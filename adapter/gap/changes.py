@@ -30,12 +30,8 @@ from adapter.model.spatial import Array
 from adapter.screening.screen import moving_joints
 
 WINDOW_S, MOST_WINDOWS = 2.0, 2048
-BY_LOAD = 0.7  # of what a change explains: it is one of the load
-DATED = 2  # rounds in which the date of a load is sought
 CHANGES, LOUD = 3, 1  # stretches that are added at most: around changes, where it is loud
 AROUND_S = 4.0  # length of one
-LEAST_CHI2 = 200.0  # of a change, times what windows scatter more than noise does
-LOUDER = 4.0  # times the usual power
 MARGIN = 2  # windows at either end
 
 
@@ -91,7 +87,7 @@ class Windows:
         spans = [(0, len(self.rows))]
         while spans and len(found) < CHANGES:
             chi2, k, span = max((*self._best(*span), span) for span in spans)
-            if chi2 < LEAST_CHI2 * max(self.usual, 1.0):
+            if chi2 < 200.0 * max(self.usual, 1.0):  # above what windows scatter
                 break
             found.append(k)
             spans.remove(span)
@@ -105,7 +101,7 @@ class Windows:
         out = []
         for begin, k, end in zip(ends, ends[1:], ends[2:], strict=False):
             whole, alone = (self._gain(begin, end, [k], at)[0] for at in (slice(None), body))
-            if alone > BY_LOAD * whole:
+            if alone > 0.7 * whole:  # of what a change explains: it is one of the load
                 out.append(self.every_s * k)
         return out
 
@@ -114,7 +110,7 @@ class Windows:
         usual = self.usual
         loud = np.where(self.rows > 0.0, self.power / np.maximum(self.rows, 1.0), 0.0)
         out = [self._around(k) for k in self.changes]
-        while len(out) < CHANGES + LOUD and loud.max() > LOUDER * usual:
+        while len(out) < CHANGES + LOUD and loud.max() > 4.0 * usual:  # times the usual power
             k = int(np.argmax(loud))
             middle = self.every_s * (k + 0.5)
             if not any(a <= middle <= b for a, b in out):
@@ -176,7 +172,7 @@ def loaded(nominal: Fit, joints: Sequence[int], times_s: Sequence[float]) -> Fit
     """
     load = load_in(nominal, None)
     loads = [load, *(replace(load, interval_s=(t, np.inf)) for t in times_s)]
-    for _ in range(DATED):
+    for _ in range(2):  # rounds in which the date of a load is sought
         arm = loaded_arm(nominal, joints, loads)
         loads = [replace(e, interval_s=_dated(arm.fit, k)) for k, e in enumerate(loads)]
     arm = loaded_arm(nominal, joints, loads)

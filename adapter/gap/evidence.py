@@ -138,7 +138,6 @@ class Moments(Normal):
 
 
 BAND_HZ = 25.0  # samples a second
-WINDOW = 50  # samples, 2 s
 LEAST_NM = 1e-4  # N m; no torque sensor is quieter
 
 
@@ -177,7 +176,7 @@ def quiet_noise(residual: Array) -> Noise:
     What happens but once, a contact or a load that is picked up, is no noise then, and what comes
     in at some time and stays is none.
     """
-    k = max(len(residual) // WINDOW, 1)
+    k = max(len(residual) // 50, 1)  # samples, 2 s
     windows = residual[: k * (len(residual) // k)].reshape(k, -1, residual.shape[1])
     level = np.sqrt(np.median(windows.var(axis=1), axis=0) + LEAST_NM**2)
     return Noise(level, np.full(len(level), BAND_HZ * MEMORY_S[0]))

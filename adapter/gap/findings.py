@@ -22,16 +22,10 @@ from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
+from adapter.screening.readings import rms
 
-OVERLAP = 0.9
 OFFSET, SPRING = "torque_offset", "joint_spring"
-MOST_RIVALS = 3
-SHOWN_CHI2 = 4.0  # of an offset: two standard deviations
-OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
-SINGLED_OUT = 0.9  # probability of a link's correction
 ODD = 4.0  # standard deviations from which on a correction is a finding
-DIFFERENCE = 1e-4  # of a coefficient's prior
-CURVE_POINTS = 41  # of a law over its signal
 DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
 SMOOTH, BEFORE = 3.5, 6  # level of a residual over what so many samples before do not foretell
@@ -94,7 +88,7 @@ def _curve(fit: Fit, covariance: Array, k: int) -> dict[str, Any] | None:
         return None
     joint, at = law.by - 1 if law.by else named.candidate.joint, fit.model.stages(0)
     seen = signal_of(law.along, at.links, at.rigid, joint)
-    x = np.linspace(seen.min(), seen.max(), CURVE_POINTS)
+    x = np.linspace(seen.min(), seen.max(), 41)  # of a law over its signal
     std = _std_of(lambda values: law.curve(x, values), fit, covariance, k)
     torque = law.curve(x, named.values)
     return {"over": f"{law.along}{joint + 1}", "at": x, "torque_nm": torque, "std_nm": std}
@@ -120,7 +114,7 @@ def _std_of(
 ) -> Array:
     """Standard deviations (p,) of what hangs on the parameters of the k-th named effect."""
     named, own = fit.named[k], place_of(fit, k)
-    decode, steps = named.candidate.template.decode, DIFFERENCE * named.candidate.prior_std
+    decode, steps = named.candidate.template.decode, 1e-4 * named.candidate.prior_std  # of a prior
     at = of_values(named.values)
     slopes = np.array(
         [
@@ -144,7 +138,12 @@ def told_of(
         found: of the search; ends: recordings by name -> s, when each ends.
         trusted: (n, 10) standard deviation of the model's inertias as they were believed.
     """
-    left = leftovers_of(found, list(ends.values()))
+    # of each joint one entry: patterns, else what happens but once
+    first_end_s = next(iter(ends.values()))
+    kept = {x.joint: x for x in _patterns_left(found, first_end_s)}
+    for leftover in (*_outbursts(found.fit), *_too_smooth(found.fit, first_end_s)):
+        kept.setdefault(leftover.joint, leftover)
+    left = tuple(kept[joint] for joint in sorted(kept))
     findings = *findings_of(found, ends), *corrected_links(found, max(ends.values()), trusted)
     return doubted(sorted(findings, key=lambda f: -f.detectability), left), left
 
@@ -166,7 +165,7 @@ def corrected_links(found: Found, end_s: float, trusted: Array) -> list[Finding]
     if wrong > 1:  # one wrong link says nothing of the others, several: the whole model is poor
         odds = max(odds, float(np.log((wrong - 1) / len(odd))))
     told = [_wrong_link(fit, known, k, end_s, gain + odds) for k, gain in gains.items()]
-    return [f for f in told if f.evidence > SINGLED_OUT]
+    return [f for f in told if f.evidence > 0.9]  # probability of a link's correction
 
 
 def _gain_of_link(fit: Fit, known: Carried | Moments, k: int, trusted: Array) -> float:
@@ -211,7 +210,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     shifted = {
         e.candidate.joint
         for e, standing in zip(fit.named, found.standings, strict=True)
-        if e.candidate.effect.name == OFFSET and standing.chi2 > SHOWN_CHI2
+        if e.candidate.effect.name == OFFSET and standing.chi2 > 4.0  # two standard deviations
     }
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
@@ -224,7 +223,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
         torque = fit.model.contribution(recording, k)
         t = fit.recordings[recording].t
         on = (t >= begin) & (t < end)
-        overlaps = _overlaps(standing, named, named.candidate.joint in shifted)
+        overlaps = _overlaps(standing, named.candidate.joint in shifted)
         keys = [p.key for p in effect.parameters]
         values = {key: x for key, x in named.values.items() if key in keys}
         spread, evidence = parameter_std(fit, covariance, k), standing.probability
@@ -281,7 +280,7 @@ def _resting(spring: Finding, offset: Finding) -> Finding:
     return replace(spring, parameters=parameters, std={**spring.std, "q0": std})
 
 
-def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, float]:
+def _overlaps(standing: Standing, shifted: bool) -> dict[str, float]:
     """Other names that explain 0.9 and more of the signature, best first.
 
     `shifted`: whether an offset of the same joint was named beside it.
@@ -291,15 +290,15 @@ def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, floa
         effect = rival.candidate.effect
         if isinstance(effect, Pattern) or effect.name == standing.candidate.effect.name:
             continue
-        if rival.overlap >= OVERLAP and _is_open(standing, rival, named, shifted):
+        if rival.overlap >= 0.9 and _is_open(standing, rival, shifted):
             best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
     # of rivals that explain all but the same, those that the data favour come first
     credible = {r.candidate.effect.name: -i for i, r in enumerate(standing.rivals[::-1])}
     order = sorted(best, key=lambda name: (-round(best[name], 2), credible.get(name, 0)))
-    return {name: best[name] for name in order[:MOST_RIVALS]}
+    return {name: best[name] for name in order[:3]}  # the likeliest
 
 
-def _is_open(standing: Standing, rival: Rival, named: Named, shifted: bool) -> bool:
+def _is_open(standing: Standing, rival: Rival, shifted: bool) -> bool:
     """Whether the data leave a rival open that is a finer form of the named effect or a coarser.
 
     Friction and an offset of the same joint are asymmetric friction in other words.
@@ -308,7 +307,7 @@ def _is_open(standing: Standing, rival: Rival, named: Named, shifted: bool) -> b
     nested = mine.form in dict(other.simpler) or other.form in dict(mine.simpler)
     if not nested or (shifted and other.form == TWO_LEVELS):
         return True
-    return rival.log_evidence > standing.log_evidence - OPEN_NATS
+    return rival.log_evidence > standing.log_evidence - 3.0  # nats: it is open
 
 
 def noise_floor(fit: Fit) -> Array:
@@ -318,15 +317,7 @@ def noise_floor(fit: Fit) -> Array:
     return np.minimum(np.max(levels, axis=0), np.sqrt(np.mean(left**2, axis=0)))
 
 
-def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
-    """What no effect explains, one entry for each joint: patterns, else what happens but once."""
-    told = {x.joint: x for x in _patterns_left(found, ends)}
-    for leftover in (*_outbursts(found.fit), *_too_smooth(found.fit, ends)):
-        told.setdefault(leftover.joint, leftover)
-    return tuple(told[joint] for joint in sorted(told))
-
-
-def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
+def _too_smooth(fit: Fit, end_s: float) -> list[Leftover]:
     """Joints whose residual the samples before it foretell too well to be noise.
 
     Disturbances are slow too, but not by so much; memory, as hysteresis has it, is.
@@ -341,18 +332,18 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
         if throughout.sum() < FEW_ROWS:
             continue
         before, now = lagged[throughout, :-1], lagged[throughout, -1]
-        surprise = _rms(now - before @ np.linalg.lstsq(before, now, rcond=None)[0])
+        surprise = rms(now - before @ np.linalg.lstsq(before, now, rcond=None)[0])
         if level[j] < SMOOTH * surprise:
             continue
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
         on = slides[:, j]
         shares = {name: explained(residual[on, j], x[on]) for name, x in signals.items()}
         follows = sorted((x for x in shares if shares[x] > FOLLOWS), key=lambda x: -shares[x])
-        size = _rms(residual[on, j])
+        size = rms(residual[on, j])
         if size < DISCREPANCY * _idealised(fit, j):
             continue
         names = tuple(follows) or (f"q{j + 1}", "t")
-        out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, ends[0])))
+        out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, end_s)))
     return out
 
 
@@ -366,7 +357,7 @@ def _outbursts(fit: Fit) -> list[Leftover]:
     for j in range(fit.n):
         rows = counted[:, j]
         spans = [w for w in np.unique(window[rows]) if np.sum(rows & (window == w)) >= FEW_ROWS]
-        sizes = [_rms(residual[rows & (window == w), j]) for w in spans]
+        sizes = [rms(residual[rows & (window == w), j]) for w in spans]
         if len(sizes) < FEW_SPANS:
             continue
         usual, worst = float(np.median(sizes)), int(np.argmax(sizes))
@@ -390,7 +381,7 @@ def doubted(findings: Sequence[Finding], leftovers: Sequence[Leftover]) -> tuple
     return tuple(out)
 
 
-def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
+def _patterns_left(found: Found, end_s: float) -> tuple[Leftover, ...]:
     """What patterns found, on each joint that is not merely its named effects' inexactness."""
     fit, out = found.fit, []
     for j in range(fit.n):
@@ -399,14 +390,14 @@ def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
             continue
         parts = [fit.model.contribution(0, k)[:, j] for k in own]
         left, pattern = fit.model.residual(0)[:, j], np.sum(parts, axis=0)
-        floor, rmse = _rms(left), _rms(left + pattern)
-        if rmse < VISIBLE * floor or _rms(pattern) < DISCREPANCY * _idealised(fit, j):
+        floor, rmse = rms(left), rms(left + pattern)
+        if rmse < VISIBLE * floor or rms(pattern) < DISCREPANCY * _idealised(fit, j):
             continue
         order = np.argsort([-np.mean(part**2) for part in parts])
         signals = [s for i in order for s in fit.named[own[i]].candidate.effect.depends_on]
         dated = (fit.named[k].interval_s for k in own)
         begin, end = next((x for x in dated if x != WHOLE), WHOLE)
-        interval = max(begin, 0.0), min(end, ends[0])
+        interval = max(begin, 0.0), min(end, end_s)
         out.append(Leftover(j + 1, rmse, floor, tuple(dict.fromkeys(signals)), interval))
     return tuple(out)
 
@@ -415,16 +406,12 @@ def _idealised(fit: Fit, joint: int) -> float:
     """Torque on a joint (from 0) of the largest named effect that is an idealisation, N m rms."""
     return max(
         (
-            _rms(fit.model.contribution(e.recording or 0, k)[:, joint])
+            rms(fit.model.contribution(e.recording or 0, k)[:, joint])
             for k, e in enumerate(fit.named)
             if e.candidate.effect.inexact
         ),
         default=0.0,
     )
-
-
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 BINS = 12
@@ -442,7 +429,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> tuple[dict[str, Any],
     out = []
     for j in range(curves.before.shape[1]):
         residual = curves.before[:, j]
-        rmse = _rms(residual)
+        rmse = rms(residual)
         signals = {f"{name}{j + 1}": getattr(curves, name)[:, j] for name in SIGNALS}
         signals["t"] = curves.t
         shares = {name: explained(residual, x) for name, x in signals.items()}

@@ -29,16 +29,11 @@ from adapter.model.spatial import Array
 
 TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
-EDGE = 0.3  # of a jump of added torque: friction turns round more softly than its equation
-JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
-FAR_STEP = 3.0  # where others stay as they are
-HALVED = 7  # steps between two settings, each half of the one before
 WIDER = 2.0  # than what any arm has: what may have a name beside it
-MOST_FITTED = 0.5  # of independent rows that coefficients may have taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,7 +378,7 @@ class Fit:
         parts = zip(self.recordings, self.own_noise(), self.weights, strict=True)
         for (own, noise, weight), share in zip(parts, np.split(shares, ends), strict=True):
             rows = np.maximum(np.sum(own.sliding * weight**2, axis=0) / noise.memory, 1.0)
-            fitted = np.minimum(share.reshape(own.tau.shape).sum(axis=0) / rows, MOST_FITTED)
+            fitted = np.minimum(share.reshape(own.tau.shape).sum(axis=0) / rows, 0.5)  # at most
             out.append(replace(noise, level=noise.level / np.sqrt(1.0 - fitted)))
         return tuple(out)
 
@@ -436,13 +431,13 @@ def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
 def unsure(model: Model, recording: int, place: int) -> Array:
     """(k, n) by how much a named effect's torque may be otherwise in truth, N m."""
     effect, own = model.named[place].candidate.effect, model.recordings[recording]
-    torque, (back, ahead) = model.contribution(recording, place), JUMP_ROWS
+    torque, (back, ahead) = model.contribution(recording, place), (4, 2)  # rows around a jump
     size, shift = back + ahead + 1, (back - ahead) // 2
     # how much it changes around each instant
     jumps = maximum_filter1d(torque, size, axis=0, origin=shift)
     jumps -= minimum_filter1d(torque, size, axis=0, origin=shift)
     band = effect.band * np.abs(torque).max(axis=0) * own.slowness
-    edge = EDGE if isinstance(effect, TorqueEffect) else 0.0
+    edge = 0.3 if isinstance(effect, TorqueEffect) else 0.0  # friction turns more softly
     return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, edge * jumps)))
 
 
@@ -560,7 +555,7 @@ def _reshaped(fit: Fit, place: int) -> Fit:
     """The same where its own columns are all that changes; others stay as linear as they are."""
     carried = fit.carried()
     best, named = carried, fit.named[place]
-    for step in (FAR_STEP, *SHAPE_STEPS):
+    for step in (3.0, *SHAPE_STEPS):  # where others stay as they are
         for other in _other_shapes(named, step):
             trial = _with_shape(fit, carried, place, other)
             if trial.g @ trial.x > best.g @ best.x:
@@ -572,7 +567,7 @@ def between(fit: Fit, place: int, value: float, step: float, at: Callable[[float
     """A named effect with the setting near `value` that the data like best, up to a fine step."""
     carried = fit.carried()
     best, named = carried, fit.named[place]
-    for finer in step * 0.5 ** np.arange(1, HALVED):
+    for finer in step * 0.5 ** np.arange(1, 7):  # each half of the one before
         for other in (value - finer, value + finer):
             trial = _with_shape(fit, carried, place, at(other))
             if trial.g @ trial.x > best.g @ best.x:

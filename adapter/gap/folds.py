@@ -17,7 +17,6 @@ from adapter.model.spatial import Array
 FOLDS = 4
 FOLD_S, SHORTEST_S = 2.0, 0.2  # of a block
 LARGEST_SHARE = 0.125  # of a recording: what is left must tell what the model tells
-TIE_CHI2 = 2.0  # by which held-out data may be worse and still leave it to the evidence
 
 
 def block_s(fit: Fit) -> float:
@@ -94,8 +93,8 @@ class Folds:
 
 
 def pays_held_out(fit: Fit, folds: Folds, k: int) -> bool:
-    """Whether the k-th named effect predicts blocks that its fit has not seen."""
+    """Whether the k-th named effect predicts unseen blocks; a tie is left to the evidence."""
     own, rest = beside(fit, k)
     if fit.named[k].candidate.effect is LATENESS:  # the carried error would stand for it
         rest = rest[rest != fit.dtheta.size]
-    return folds.left(rest) - folds.left(np.concatenate([rest, own])) > -TIE_CHI2
+    return folds.left(rest) - folds.left(np.concatenate([rest, own])) > -2.0  # or a tie

@@ -14,7 +14,6 @@ from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
 from drivers.errors import choices
 
-FLANGES = ("tool0", "flange")  # what makers call the face that a tool is bolted to
 LOAD_KG = 4.0  # one standard deviation
 MASSES_KG = (0.5, 1.5, 4.5)  # that are tried: how far off a load's moments may be grows with it
 BEYOND_M, REACH_M = 0.08, 0.08  # of a load's centre from the face, and how far it may be elsewhere
@@ -90,5 +89,5 @@ def hand_frame(model: SelfModel, name: str | None = None) -> FixedFrame:
                 return frame
         have = choices(name, [frame.name for frame in (own, *riding)])
         raise ModelError(f"no frame '{name}' rides on the last link; {have}")
-    called = [frame for key in FLANGES for frame in riding if frame.name.endswith(key)]
+    called = [frame for key in ("tool0", "flange") for frame in riding if frame.name.endswith(key)]
     return (*called, *riding, own)[0]

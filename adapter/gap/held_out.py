@@ -33,11 +33,6 @@ from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
 from adapter.signals.validation import smooth
 from adapter.simulate import DrivenMotion, Simulate
 
-SEGMENT_S = 0.5
-SMEARED_MS = 101  # about an instant, in which the recipe's filter mixes torques
-NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
-ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
-THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
@@ -154,7 +149,7 @@ def torque_errors(
         rows = fold == f
         if rows.any():
             new[rows] = (tau - ModelTorque(model, own_log=True)(q, dq, ddq, t, sharp))[rows]
-    unheard = maximum_filter1d(~recording.heard_at(t), SMEARED_MS, axis=0)
+    unheard = maximum_filter1d(~recording.heard_at(t), 101, axis=0)  # ms that its filter mixes
     old[unheard] = new[unheard] = np.nan
     edge = round(RECIPE_EDGE_S / 1e-3)
     return ErrorsOverTime(t[edge:-edge], old[edge:-edge], new[edge:-edge])
@@ -204,7 +199,7 @@ def rollout_errors(
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
     heard = np.logical_or(recording.heard_at(t).all(axis=1), drive == COMMANDS)
-    length = round(SEGMENT_S / ROLLOUT_STEP_S)
+    length = round(0.5 / ROLLOUT_STEP_S)  # half a second
     segments = [
         (a, b)  # the row at b is the next start
         for a, b in pairwise(range(0, len(t), length))
@@ -216,7 +211,7 @@ def rollout_errors(
     told = np.zeros(len(t), dtype=bool)
     for begin, end in segments:  # a simulation that was refused lacks even its start
         told[begin:end] = np.isfinite(old_q[begin]).all() and np.isfinite(new_q[begin]).all()
-    thin = slice(None, None, THINNED)
+    thin = slice(None, None, 10)  # rollout rows kept for a plot: one in so many
     curves = RolloutCurves(t[thin], q[thin], old_q[thin], new_q[thin])
     return RolloutErrors(
         _off(old_q, q)[told],
@@ -386,7 +381,9 @@ def _paying(task: GapTask, found: Found) -> Found:
     level = noise_floor(found.fit)
     ways = [found, uncorrected(found)]
     loaded = any(map(from_the_start, found.fit.named))  # it is weighed beside all of the rest
-    for places in (found.weak, _springs(found)) if not loaded else ():
+    # springs that any arm may have and these data do not single out
+    springs = [k for k in found.weak if found.fit.named[k].candidate.effect is SPRING]
+    for places in (found.weak, springs) if not loaded else ():
         if places:
             fewer = _without(found, places)
             ways += [fewer, uncorrected(fewer)]
@@ -397,11 +394,6 @@ def _paying(task: GapTask, found: Found) -> Found:
             break
         best = min(less, key=lambda x: x.cost)
     return best.found
-
-
-def _springs(found: Found) -> frozenset[int]:
-    """Places of springs that any arm may have and these data do not single out."""
-    return frozenset(k for k in found.weak if found.fit.named[k].candidate.effect is SPRING)
 
 
 def _without(found: Found, places: Collection[int]) -> Found:
@@ -422,7 +414,7 @@ def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
         if from_the_start(fit.named[k]):
             continue
         size = np.abs(fit.model.contribution(fit.named[k].recording or 0, k)).max(axis=0)
-        if (size[joints] > ACTS * size.max()).any():
+        if (size[joints] > 0.1 * size.max()).any():  # a joint that it acts on
             less = _without(found, (k,))
             out.append(less if fit.dtheta.any() else uncorrected(less))
     return out
@@ -434,7 +426,7 @@ def uncorrected(found: Found) -> Found:
     What is known of the coefficients stays what is known with the inertias free within their
     prior: that they are left alone does not make them any surer.
     """
-    fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
+    fit, carried = refitted(replace(found.fit, prior=1e-4 * found.fit.prior))  # next to none
     model = replace(fit.model, dtheta=np.zeros_like(fit.dtheta))
     kept = replace(fit, model=model, prior=found.fit.prior)
     return replace(found, fit=kept, carried=carried, known=kept.carried(), under=fit)

@@ -18,8 +18,6 @@ from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, BEST_OF_JOINT, FORMS, Lead, SignatureTable
 
 STRIBECK = CATALOGUE["stribeck_friction"]
-MOST_TERMS = 3  # of one joint: more are a curve with another name
-PASSIVE = 0.03  # share of exchanged energy that a law may feed in and count as friction
 STEP = 0.1  # of what was seen: between two settings that are tried
 
 
@@ -31,7 +29,7 @@ def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
     for joint in sorted({e.candidate.joint for e in fit.named if _gives_way(e)}):
         if any(e.candidate.joint == joint and _nameless(e) for e in fit.named):
             fit = falling(fit, joint)
-        fit = _of_joint(fit, joint, MOST_TERMS if joint not in without else 0)
+        fit = _of_joint(fit, joint, 3 if joint not in without else 0)  # more are a curve
     return fit
 
 
@@ -54,7 +52,7 @@ def notes_on(fit: Fit) -> list[str]:
         given = float(-power[power < 0.0].sum() / max(np.abs(power).sum(), 1e-12))
         if law.variables == {"q"} and not law.by:
             does = "stores energy and gives it back, as a spring does"
-        elif given < PASSIVE:
+        elif given < 0.03:  # share of exchanged energy that a law may feed in and count as friction
             does = "takes energy, as friction does"
         else:
             does = f"feeds energy in: {given:.0%} of what it exchanges".replace("%", " %")

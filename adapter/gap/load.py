@@ -39,12 +39,8 @@ from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log
 
-SHARED_SHARE = 0.2  # of the inertias, with a log without the load
-MOVES_S = 1.0  # of motion, or the arm hardly moves
 SHOWN = 3.0  # standard deviations: what is smaller is not there, or not shown
 COM_M, INERTIA_SHARE = 0.05, 0.5  # standard deviations above which a number is not shown
-STEP = 1e-6
-LEAST_S = 0.3  # of rows
 EDGE, EVERY = 60, 10  # ms at either end, where the filter has no neighbours; between rows
 CLEAR, LEAST_CHANGE_KG = 6.0, 0.05  # standard deviations of a change; what is less is not told
 
@@ -114,7 +110,7 @@ def find_load(
         model, said = present(model, one.joint_names, one.path.name)
         notes += [*one.warnings, *said]
     riding = hand_frame(model, frame)
-    share = inertia_prior or (DOCUMENTED_SHARE if empty is None else SHARED_SHARE)
+    share = inertia_prior or (DOCUMENTED_SHARE if empty is None else 0.2)  # of the inertias
     taken = [_taken(one, model) for one in logs]
     notes += [note for x in taken for note in x.notes]
     std, n, whole = prior_std(model.theta, share), model.tree.n, taken[0].moments.together()
@@ -162,7 +158,7 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
         own = survey.busiest(log)
     own, _, said = cleaned(own, model)
     smoothed, torque = smoothed_rows(own), Judged()
-    moves = float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S >= MOVES_S
+    moves = float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S >= 1.0  # s
     more = ["the arm hardly moves: static friction in its joints counts as load"]
     if moves:  # asked of the arm without what is fitted: a load of 90 kg explains N cm
         dead = silent(own, model.tree.joint_names)
@@ -172,7 +168,7 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
     own = torque.in_time(own if survey is None else survey.log)
     moments = _of_all(own, torque.mounted(model))
     left_s = float(moments.rows.sum()) * moments.period_s
-    if left_s < LEAST_S:
+    if left_s < 0.3:  # of rows
         raise RecordingRefused(
             RecordingFault.DATA,
             f"{log.path}: its pauses leave {left_s:.2g} s to weigh by; record at least "
@@ -243,7 +239,7 @@ def load_of(theta: Array, covariance: Array, frame: FixedFrame) -> HandLoad:
     turn = move_theta(np.eye(10), *back)  # row i: of a unit of parameter i
     theta, covariance = theta @ turn, turn.T @ covariance @ turn
     mass, com, inertia = body_from_theta(theta)
-    steps = STEP * np.diag(np.sqrt(np.diagonal(covariance)))
+    steps = 1e-6 * np.diag(np.sqrt(np.diagonal(covariance)))
     slopes = np.array([(_body(theta + d) - _body(theta - d)) / (2.0 * d.max()) for d in steps])
     std = np.sqrt(np.diagonal(slopes.T @ covariance @ slopes))
     values, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)

@@ -50,19 +50,12 @@ from drivers.files.rows import RowsFile, stretches
 LONG_S = 60.0  # what is longer is searched in stretches
 PIECE_S = 30.0  # of a recording that is worked on at once
 FEWEST, FIRST = 1000, 4096  # samples of a piece; by which the usual step is told
-AHEAD = 200  # samples behind a piece that are looked at: is the last stamp one far ahead?
 OVERLAP_S = 2.0  # by which splines reach over a piece; their memory is some 0.1 s
 HOLE_S = 0.5  # without samples: nobody knows how the arm moved, the motion is cut there
 STRETCH_S, STRETCHES = 5.0, 6  # of a search: length, and how many
-MOST_WINDOWS = 1500  # that stretches are chosen among
-NANO_S = 1e-9  # a time less so much is before it
-EVERY_S = 0.02  # samples by which a window is told
-WHOLE_SHARE = 0.8  # of the samples that a window should have
 SCREENED_S = 40.0  # in one piece, where most moves: units, signs and order are judged there
-SCORED_EDGE_S = 0.3  # around a stretch, see `signals.validation`
 TRIM = 20  # samples of the band (0.8 s) at either end, in which filters settle
 APART = 2 * TRIM + TAPS // DECIMATION + 1  # samples between stretches that share no motion
-LEAST_SAMPLES = round(LEAST_S * RATE_HZ / DECIMATION)
 
 Span = tuple[float, float]  # s since the first sample
 
@@ -84,7 +77,7 @@ def _usable(log: Log, clocks: list[tuple[int, RecordingClock]]) -> Iterator[Log]
     """Usable samples in order, piece by piece; `clocks` gets each one's first stamp and clock."""
     size, last = max(round(PIECE_S / _step_s(log)), FEWEST), -np.inf
     for start in range(0, len(log), size):
-        seen = log.piece(start, start + size + AHEAD)
+        seen = log.piece(start, start + size + 200)  # is the last stamp one far ahead?
         rows, raw = uniform(seen.stamp_ns, seen.q, seen.dq, seen.tau), seen.piece(0, size)
         own = raw.take(rows[rows < size])
         if len(own):
@@ -129,16 +122,16 @@ class Survey:
         begins_s = [1e-9 * (stamp - own.first_ns) for stamp, _ in clocks]
         clock = joined([clock for _, clock in clocks], begins_s)
         bare = cls(own, clock, np.zeros(0), np.zeros(0))
-        every = max(STRETCH_S, bare.end_s / MOST_WINDOWS)
-        step = max(round(EVERY_S * clock.rate_hz), 1)
+        every = max(STRETCH_S, bare.end_s / 1500)  # among so many stretches are chosen
+        step = max(round(0.02 * clock.rate_hz), 1)  # samples by which a window is told
         told = []
         for begin in every * np.arange(max(int(bare.end_s / every), 1)):
-            some = own.piece(*bare.rows(begin, begin + STRETCH_S - NANO_S))
+            some = own.piece(*bare.rows(begin, begin + STRETCH_S - 1e-9))
             signals = np.column_stack([np.ones(len(some)), some.q, some.dq])[::step]
             if len(signals):
                 told.append((begin, len(signals), signals.T @ signals / len(signals)))
         begins, counts, moments = (np.array(x) for x in zip(*told, strict=True))
-        moments[counts < WHOLE_SHARE * counts.max()] = np.nan
+        moments[counts < 0.8 * counts.max()] = np.nan  # of the samples that a window should have
         return replace(bare, begins=begins, moments=moments)
 
     @property
@@ -282,7 +275,7 @@ class LongRecording(Recorded):
     def taking(self, spans: Sequence[Span]) -> LongRecording:
         """With these stretches; those that touch are one."""
         spans = [(run.t(a), run.t(b - 1)) for run, a, b in self._samples(spans)]
-        edge, survey = SCORED_EDGE_S, self.survey
+        edge, survey = 0.3, self.survey  # around a stretch, see `signals.validation`
         parts = [survey.recorded(*survey.rows(a - edge, b + edge)) for a, b in spans]
         begins = np.cumsum([0, *(len(x.t) for x in parts[:-1])])
         t, q, dq, tau = (
@@ -317,7 +310,7 @@ class LongRecording(Recorded):
             run = max(self.runs, key=lambda r: min(r.t(r.samples), end) - max(r.t(0), begin))
             a = max(run.sample(max(begin, self.span[0])), 0)
             b = min(run.sample(min(end, self.span[1])), run.samples)
-            if b - a < LEAST_SAMPLES:
+            if b - a < round(LEAST_S * RATE_HZ / DECIMATION):
                 continue
             if out and out[-1][0] is run and a - out[-1][2] < APART:
                 out[-1] = run, out[-1][1], max(b, out[-1][2])

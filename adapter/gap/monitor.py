@@ -24,23 +24,15 @@ from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, Disagreement
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.learning.change import extremes, is_new
 from adapter.learning.learner import OnlineLearner
-from adapter.learning.theta import Theta
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
 
 VISCOUS = CATALOGUE["viscous_friction"]
 BLOCK_NS = 40_000_000  # states averaged to one row
-ROWS_PER_S = 1e9 / BLOCK_NS
-HOLE_NS = 20_000_000  # a longer hole between two states ends a block without a row
-ENOUGH = 3000  # states behind θ before its least squares is taken over
 TRUST = 4.0  # the learner's information counts one in so many
-KEEP = 1.0 - 0.2 / 120.0  # of the belief, from one group to the next
 STRIBECK_SPEEDS = (0.03, 0.1)  # rad/s; between them, static friction's shape is a sum of theirs
 DRIFT = 0.2  # of friction: no law of it is better from one move to the next
-KNOWN_SHARE = 0.2  # of a new rate, from a group in which it was seen: it takes a second
-MOVED = 1e-3  # rad and m; frames that moved less make no torque of interest
-START_INFLATION = 2.0  # of sums of rows, before it is measured
 
 
 class Mark(IntEnum):
@@ -64,7 +56,7 @@ def average(table, first, marks, total, rows):
     for m in range(table.shape[0]):
         stamp = table[m, :1].view(np.int64)[0]
         count, since_last = marks[Mark.COUNT], stamp - marks[Mark.LAST_NS]
-        if count and not 0 < since_last <= HOLE_NS:
+        if count and not 0 < since_last <= 20_000_000:  # a longer hole ends a block without a row
             marks[Mark.COUNT] = 0
         elif count and stamp - marks[Mark.BEGIN_NS] >= BLOCK_NS:
             rows[full, 0] = 1e-9 * (marks[Mark.BEGIN_NS] + marks[Mark.SINCE_NS] / count)
@@ -155,8 +147,8 @@ class Monitor:
         if self._frames is not None and not self._found.active:
             R0, p = learner.frames
             moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
-            outdated = moved > MOVED or self._changes < len(learner.changes)
-        if learner.theta.count >= ENOUGH and outdated:
+            outdated = moved > 1e-3 or self._changes < len(learner.changes)  # rad, m
+        if learner.theta.count >= 3000 and outdated:  # states behind its least squares
             self._take_over(learner)
         if self._frames is None:
             return
@@ -184,7 +176,7 @@ class Monitor:
         self._belief.extend(np.tile(more, len(STRIBECK_SPEEDS)))
         R0, p = learner.frames
         self._frames = LearnedFrames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
-        self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
+        self._level = Level(theta.variance(theta.least_squares()), 2.0)  # a first guess
         self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []
 
@@ -193,15 +185,6 @@ class Monitor:
         own = slice(10 * self._n, self._size)
         squares = np.square(self._belief.mean()[own]) + np.square(self._belief.std()[own])
         return np.asarray(squares.reshape(-1, self._n))
-
-    def _unsure(self, theta: Theta, dq: Array) -> Array:
-        """(m, n) variance of what friction holds at velocities dq (m, n), (N m)².
-
-        At a rest static friction is one unknown value however many rows the rest lasts; those of
-        a second tell then as much as one.
-        """
-        held = np.square(slowness(dq)) * theta.banded(self._squares())
-        return np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0) * held
 
     def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
         """A group is full: judge the window with it, and let the oldest group into the belief."""
@@ -233,7 +216,10 @@ class Monitor:
         signatures = frames.signatures(q, dq, ddq, model, Y)
         # a joint that comes to a rest or leaves one within a row rests in it
         slowest = np.maximum(np.abs(dq) - 1e-9 * BLOCK_NS * np.abs(ddq), 0.0)
-        unsure = self._unsure(learner.theta, slowest)
+        # (N m)²; at a rest static friction is one unknown value however many rows the rest lasts:
+        # those of a second tell then as much as one
+        held = np.square(slowness(slowest)) * learner.theta.banded(self._squares())
+        unsure = np.where(slowest < SMOOTHING_DQ, 1e9 / BLOCK_NS, 1.0) * held
         rates = np.hstack([dq, ddq])
         new = is_new(rates, self._rates).astype(float)
         return RowGroup(t, Z, signatures, tau - tool, unsure, rates, new)
@@ -247,7 +233,7 @@ class Monitor:
         if (weight == own).all():
             self._level.look(residual, group.unsure)
         flat = Z.reshape(-1, Z.shape[2])
-        self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
+        self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), keep=1.0 - 0.2 / 120.0)
         self._found.forget_before(float(group.t[0]), self._belief)
         further = extremes(np.concatenate([self._rates, group.rates]))
-        self._rates += KNOWN_SHARE * (further - self._rates)
+        self._rates += 0.2 * (further - self._rates)  # seen, a new rate is known after a second

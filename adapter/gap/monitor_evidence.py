@@ -25,8 +25,6 @@ ROWS_PER_GROUP = 5
 CLIP = 9.0  # times its level: what a row says at most about the level
 LEVEL_ROWS, LEVEL_SUMS = 250.0, 40.0  # rows and sums that the level is averaged over
 START_SUMS = 5.0  # that the first guess of the level counts
-LEAST_INFLATION = 1.2
-NOTHING_KNOWN = 1e12  # (N m)²
 
 
 class Belief:
@@ -128,7 +126,7 @@ class RowGroup:
     @property
     def doubt(self) -> Array:
         """(r, n) `unsure`, and all but infinite where the belief foretells nothing, (N m)²."""
-        return self.unsure + NOTHING_KNOWN * self.new
+        return self.unsure + 1e12 * self.new  # (N m)²
 
     @classmethod
     def joined(cls, groups: Sequence[RowGroup]) -> RowGroup:
@@ -238,4 +236,4 @@ class Level:
 
     def weight(self, unsure: Array) -> Array:
         """(r, n) information that each row has, 1/(N m)²."""
-        return np.asarray(1.0 / (np.maximum(self.long, LEAST_INFLATION * self.row) + unsure))
+        return np.asarray(1.0 / (np.maximum(self.long, 1.2 * self.row) + unsure))

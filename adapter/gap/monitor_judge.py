@@ -16,20 +16,12 @@ from adapter.gap.result import UNEXPLAINED
 from adapter.model.spatial import Array
 
 GROUPS = 10  # in the window, 0.2 s each
-THRESHOLD = 12.0  # log evidence of a report
-MARGIN = 3.0  # log evidence by which the best name leads when it is told at once
-NEW = 4.0  # log evidence for a start inside the window against one before it
-SOONEST_S = 0.7  # after its start: before, all names look alike
 LATEST_S = 1.4  # after its start the best name is told even if another is close
 OVER_THRESHOLD = 10.0
 OVER_SHARE = 0.7  # of the best new name's evidence, which has more freedom around the edge
-QUIET_GROUPS = 30  # after the start, while the window fills
-REST_S = 0.9  # after a report before the next one
 EDGE_ROWS, HALF_ROW_S = 3, 0.02
 LEFT_RATIO, LEFT_SHARE = 4.0, 0.15  # of the level, of the residual: more is left unexplained
 POWER, POWER_OVER, POWER_S = 6.0, 2.0, 1.0  # times the level over a second: something, nothing
-POWER_ROWS = 25
-MOST = 6  # disagreements at a time
 
 
 class DisagreementDetector:
@@ -58,7 +50,7 @@ class DisagreementDetector:
         scores = self._all.evidence(G, b)
         left = evidence.residual - evidence.rows.Z @ evidence.shift
         left *= np.sqrt(self._level.share(evidence.rows.doubt))
-        each = np.reshape(left[-POWER_ROWS:] ** 2, (-1, ROWS_PER_GROUP, left.shape[1])).mean(axis=1)
+        each = np.reshape(left[-25:] ** 2, (-1, ROWS_PER_GROUP, left.shape[1])).mean(axis=1)
         power = np.median(each, axis=0) / self._level.row  # most of a second, not one jump in it
         ended = False
         for found in self._found.active:
@@ -67,11 +59,11 @@ class DisagreementDetector:
                 self._found.close(found, over_s)
                 ended = True
                 break
-        ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
-        if not ended and ready and len(self._found.active) < MOST:
+        ready = self._judged >= 30 and now_s >= self._quiet_until_s  # the window has filled
+        if not ended and ready and len(self._found.active) < 6:  # disagreements at a time
             self._report_something(evidence, scores, power)
         if ended or len(self._found.reports) > before:
-            self._quiet_until_s, self._began_s = now_s + REST_S, np.inf
+            self._quiet_until_s, self._began_s = now_s + 0.9, np.inf  # s to the next report
         self._found.refresh(self._belief, evidence)
 
     def _evidence(self, weight: Array | None = None) -> Evidence:
@@ -111,7 +103,7 @@ class DisagreementDetector:
         """Tell the best candidate if it leads, or that nothing explains what is new."""
         best = scores.max(axis=1)
         which = int(np.argmax(best))
-        if best[which] <= THRESHOLD:
+        if best[which] <= 12.0:  # log evidence of a report
             self._began_s = np.inf  # but that no candidate looks like may be there for a second
             known = {j for found in self._found.active for j in found.joints if found.lasts}
             loud = np.flatnonzero(power > POWER)
@@ -124,13 +116,13 @@ class DisagreementDetector:
         G, b = evidence.information(1, candidate.columns)
         fine = candidate.evidence(G, b)
         first = int(np.argmax(fine))
-        if fine[first] - fine[0] < NEW:  # it may have been there all along: nothing new
+        if fine[first] - fine[0] < 4.0:  # it may have been there all along: nothing new
             return
         self._began_s = min(self._began_s, float(t[first]))
         if self._now_s - self._began_s >= LATEST_S:  # the start may wander; then the first counts
             first = min(first, int(np.searchsorted(t, self._began_s)))
         age_s = self._now_s - float(t[first])
-        if age_s >= SOONEST_S:
+        if age_s >= 0.7:  # after its start: before, all names look alike
             self._name(evidence, first, float(np.sqrt(2.0 * best[which])), age_s < LATEST_S)
 
     def _name(self, evidence: Evidence, first: int, score: float, may_wait: bool) -> None:
@@ -143,7 +135,7 @@ class DisagreementDetector:
         best = self._all.evidence(G, b)[:, 0]
         order = np.argsort(-best)
         which = int(order[0])
-        close = [self._candidates[k] for k in order[1:4] if best[k] > best[which] - MARGIN]
+        close = [self._candidates[k] for k in order[1:4] if best[k] > best[which] - 3.0]  # nats
         if close and may_wait:
             return
         candidate = self._candidates[which]
@@ -171,7 +163,6 @@ class DisagreementDetector:
 
 SAME_S, WIDER = 0.5, 3.0  # of one thing that is larger than its prior: told since; times that prior
 EDGE_S = 0.1  # around starts and ends, where the filter is between two states
-MUTED = 1e-3  # weight of a joint with something unexplained
 
 
 @dataclass(eq=False)
@@ -294,7 +285,7 @@ class DisagreementList:
         weight = weight.copy()
         for found in self.active:
             if found.candidate is None:
-                weight[:, found.joints] *= MUTED
+                weight[:, found.joints] *= 1e-3  # weight of a joint with something unexplained
             for edge in (found.since_s, found.over_s):
                 weight[np.abs(t - edge) < EDGE_S] = 0.0
         return weight

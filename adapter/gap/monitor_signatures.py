@@ -20,7 +20,6 @@ from adapter.model.spatial import Array
 from adapter.physics import kernels
 from adapter.screening.likelihood import LOAD_STD
 
-SMALLEST_MASS = 0.02  # kg; below it a load has no centre
 JOINT_ODDS = -6.0  # ln of how much more rarely than a hand grips or lets go a joint changes
 
 
@@ -68,7 +67,7 @@ class Signature:
 
     def decode(self, x: Array) -> dict[str, Any]:
         """Coefficients (k,) as parameters of the catalogue, those that are one number."""
-        if self.effect.is_theta and x[0] < SMALLEST_MASS:
+        if self.effect.is_theta and x[0] < 0.02:  # kg; below it a load has no centre
             return {self.effect.parameters[0].key: float(x[0])}
         values = self.effect.templates()[0].decode(x)
         return {key: value for key, value in values.items() if np.ndim(value) == 0}

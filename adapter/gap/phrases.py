@@ -15,8 +15,6 @@ from adapter.gap.result import Finding
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import plain, plus_minus
 
-SMALL_RAD = 0.1  # angles below it are shown in mrad
-MOST_PARTS = 4  # of a change of ten inertial parameters
 SHOWN_UNITS = {
     "1": (100.0, "%"),
     "s": (1e3, "ms"),
@@ -37,7 +35,7 @@ def measured(value: Any, std: Any, unit: str) -> str:
 
 def shown_unit(value: Any, unit: str) -> tuple[float, str]:
     """(factor, name) of the unit in which a value of a file's unit is shown."""
-    if unit == "rad" and 0.0 < abs(_number(value)) < SMALL_RAD:
+    if unit == "rad" and 0.0 < abs(_number(value)) < 0.1:  # angles below it are shown in mrad
         return 1e3, "mrad"
     return SHOWN_UNITS.get(unit, (1.0, with_squares(unit)))
 
@@ -68,7 +66,7 @@ def parameter_lines(finding: Finding) -> list[str]:
         surety = np.where(usable, np.abs(value) / np.where(usable, doubt, 1.0), 0.0)
         if not usable.any():
             surety = np.abs(value)
-        for k in sorted(k for k in np.argsort(-surety)[:MOST_PARTS] if surety[k] > 0.0):
+        for k in sorted(k for k in np.argsort(-surety)[:4] if surety[k] > 0.0):
             lines.append(f"Δ{PARAMETERS[k]} = {plus_minus(value[k], doubt[k])} {UNITS[k]}")
     return lines
 

@@ -46,13 +46,6 @@ BRISTLES = CATALOGUE["bristle_friction"]
 EVERYWHERE = (BRISTLES, OFFSET)
 SPRING = CATALOGUE["joint_spring"]
 DRIVEN = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"])
-WHERE_IT_MOVES = (*DRIVEN, SPRING)
-USUAL = {BRISTLES: 1}  # of the templates: bristles of a Panda
-# Of the whole arm: what its torques lack of the motion's band, and a table that is not level
-OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
-AT_ZERO = 1e-3  # N m/rad: where a spring rests is in the offset beside it
-WAY_ROUNDS = 3
-LIGHTEST_KG = 0.1
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
 
 
@@ -128,7 +121,7 @@ def real_arm(fit: Fit, joints: Sequence[int], loaded: Sequence[int]) -> RealArm:
 def loaded_arm(fit: Fit, joints: Sequence[int], loads: Sequence[Named]) -> RealArm:
     """The nominal model with these loads, and all that any arm may have; see `real_arm`."""
     trial = _as_any_arm(fit.with_named(loads), joints)
-    for _ in range(WAY_ROUNDS):
+    for _ in range(3):
         found, known = under_own_noise(trial)
         fitting = [e if e.assumed else fitting_way(fit, e) for e in found.named]
         if list(map(_way, fitting)) == list(map(_way, trial.named)):
@@ -163,7 +156,7 @@ def with_a_load(fit: Fit) -> tuple[Named, ...]:
 
 def fitting_way(fit: Fit, load: Named) -> Named:
     """A load, looked for as one of about its mass."""
-    mass = max(float(load.x[0]), LIGHTEST_KG)
+    mass = max(float(load.x[0]), 0.1)  # kg
     way = min(range(len(MASSES_KG)), key=lambda k: abs(float(np.log(mass / MASSES_KG[k]))))
     template = fit.model.hand.templates()[way]
     return replace(load, candidate=replace(load.candidate, template=template))
@@ -220,14 +213,14 @@ def _named(effect: Effect, template: Template, joint: int) -> Named:
 
 def _assumed(effect: Effect, joint: int) -> Named:
     """An effect that any arm has, of its usual size (`priors`, or as its template says)."""
-    template = effect.templates()[USUAL.get(effect, 0)]
+    template = effect.templates()[1 if effect is BRISTLES else 0]  # bristles of a Panda
     if effect.name in EFFECT_STD:
-        std = EFFECT_STD[effect.name], *[AT_ZERO] * (len(template.prior_std) - 1)
+        std = EFFECT_STD[effect.name], *[1e-3] * (len(template.prior_std) - 1)  # N m/rad
         template = replace(template, prior_std=std)
     return replace(_named(effect, template, joint), assumed=True)
 
 
-def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = WHERE_IT_MOVES) -> Fit:
+def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = (*DRIVEN, SPRING)) -> Fit:
     """With dry friction and offsets of all torques and what joints (from 0) that move have."""
     own = [
         _assumed(effect, j)
@@ -239,7 +232,7 @@ def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = WHERE_IT
 
 
 def _as_any_arm(fit: Fit, joints: Sequence[int]) -> Fit:
-    """The same, with what the whole arm has."""
+    """The same, with what the whole arm has: a filter of its torques, a table that is not level."""
     fit = _beside(fit, joints)
-    whole = [_assumed(effect, -1) for effect in OF_THE_WHOLE]
+    whole = [_assumed(CATALOGUE[name], -1) for name in ("torque_filter", "base_tilt")]
     return fit.with_named([*fit.named, *whole])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,28 +14,6 @@ from drivers.files.html_table import html_table
 
 UNEXPLAINED = "unexplained"  # the name of what no effect of the catalogue explains
 WORSE = 0.05  # share by which an error of a joint may grow on data not seen, and unsaid
-
-# Of `GapResult`, as they are in the JSON file.
-IN_FILE = (
-    "problem",
-    "noise_floor_nm",
-    "before",
-    "after",
-    "model_out",
-    "where",
-    "what_next",
-    "simulator",
-    "stopped_after_rounds",
-    "notes",
-    "contradictions",
-    "in_sample",
-    "recordings",
-    "model_in",
-    "joint_names",
-    "wall_s",
-    "torque_gains",
-    "sampled",
-)
 
 
 @dataclass(frozen=True)
@@ -318,7 +296,9 @@ class GapResult:
 
     def as_dict(self) -> dict[str, Any]:
         """All but the curves; `adapter.gap.words.as_json` adds the headline."""
-        own = {key: getattr(self, key) for key in IN_FILE}
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        for key in ("model_name", "curves", "rollouts", "corrections", "corrections_prior"):
+            del own[key]
         for key in ("before", "after"):
             own[key] = asdict(own[key])
         own["findings"] = [finding.as_dict() for finding in self.findings]

@@ -16,9 +16,7 @@ from adapter.gap.fit import Fit, Named, beside, distance_of, refitted
 from adapter.gap.scan import SignatureTable
 from adapter.model.spatial import Array
 
-WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
 DATES = 50.0  # starts that were looked at
-SAME_SHARE = 0.5  # of a signature that another name for it explains
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class Rival:
     @property
     def is_alike(self) -> bool:
         """Whether it is another name for the named effect, and not another effect."""
-        return self.overlap > SAME_SHARE
+        return self.overlap > 0.5  # of a signature that another name for it explains
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,18 +89,9 @@ def price(named: Named) -> float:
     return float(odds - np.log(DATES) * (timed + passing))
 
 
-@dataclass(frozen=True, eq=False)
-class _Products:
-    """Products of all candidates' white signatures in one interval.
-
-    Attributes:
-        carried: (c, p) with the fit's own; data: (c,) with the data.
-        own: of each candidate with itself, (k, k).
-    """
-
-    carried: Array
-    data: Array
-    own: tuple[Array, ...]
+# Of all candidates' white signatures in one interval: (c, p) products with the fit's own, (c,) with
+# the data, and (k, k) of each candidate's with one another.
+_Products = tuple[Array, Array, tuple[Array, ...]]
 
 
 def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standing, ...]:
@@ -114,7 +103,7 @@ def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standi
         if when not in products:
             X = fit.whiten(table.within(*when))
             own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in table.candidates)
-            products[when] = _Products(X @ carried.N.T, X @ carried.data, own)
+            products[when] = X @ carried.N.T, X @ carried.data, own
         out.append(_standing(fit, carried, table.candidates, products[when], k))
     return tuple(out)
 
@@ -183,11 +172,12 @@ def _rivals(
     Its coefficients are at `own`; all but these, at `rest`, have explained what they can.
     """
     others, mine = carried.part(rest), named.x @ carried.G[own]
-    C = products.carried[:, rest]
+    with_fit, with_data, alone = products
+    C = with_fit[:, rest]
     solved = others.solved(C)
     size = float(mine[own] @ named.x - others.solved(mine[rest]) @ mine[rest])
-    cross = products.carried[:, own] @ named.x - solved @ mine[rest]
-    left = products.data - solved @ others.g
+    cross = with_fit[:, own] @ named.x - solved @ mine[rest]
+    left = with_data - solved @ others.g
     found: dict[int, Rival] = {}
     alike: dict[int, list[int]] = {}
     for i, c in enumerate(candidates):
@@ -195,10 +185,10 @@ def _rivals(
     for places in alike.values():
         at = np.array([candidates[i].columns for i in places])
         std = np.array([candidates[i].prior_std for i in places])
-        G = np.array([products.own[i] for i in places])
+        G = np.array([alone[i] for i in places])
         G -= solved[at] @ C[at].swapaxes(1, 2)
         evidence, chi2, x = scores(G, left[at], std)
-        wide = G + (WIDE * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])
+        wide = G + (10.0 * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])  # how far it could go
         reached = np.linalg.solve(wide, cross[at][..., None])[..., 0]
         overlap = np.einsum("bi,bi->b", cross[at], reached) / size
         for b, i in enumerate(places):

@@ -47,9 +47,6 @@ CATALOGUED, PATTERNS, FORMS = "catalogued", "patterns", "forms"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 AT_ONCE = 24  # candidates of a long recording
-FEWEST_BLOCKS = 1  # nothing shorter is dated
-FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
-RICH_ROUNDS = 2
 LONGEST_CONTACT_S = 8.0
 MARGIN_S = 0.8  # a start so near either end is no change
 
@@ -99,11 +96,11 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, heard
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
-    sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
+    sigma = 0.2 * residual.std(axis=0) + LEAST_NM  # of the residual that may be noise, for a start
     white, data = X[used], (residual / sigma).ravel()
     white *= heard / sigma
     white = white.reshape(len(used), -1)
-    for _ in range(RICH_ROUNDS):
+    for _ in range(2):
         information = white @ white.T
         information[np.diag_indices(len(used))] += prior[used] ** -2.0
         x[used] = cho_solve(cho_factor(information, lower=True), white @ data)
@@ -136,10 +133,12 @@ class SignatureTable:
     ) -> None:
         tables, noise = [], []
         extra = self._patterns(fit, joints) if kind == PATTERNS else []
-        extra += self._laws(fit, joints if kind != CATALOGUED else self._rivalled(fit, joints))
+        stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
+        lawful = joints if kind != CATALOGUED else self._rivalled(fit, joints)
+        extra += [way for j in lawful for way in laws(stages, j)]
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
-            table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
+            table, self.candidates = signatures(stages[i], joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
                 own, heard = fit.model.residual(i), fit.recordings[i].heard
@@ -160,10 +159,6 @@ class SignatureTable:
     def X(self) -> Array:
         """(c, r) all signatures, white."""
         return self.fit.whiten(self.tables)
-
-    def _laws(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int, Template]]:
-        stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
-        return [way for j in joints for way in laws(stages, j)]
 
     def _rivalled(self, fit: Fit, joints: Sequence[int]) -> list[int]:
         """Joints that have a law, or an effect that one may be taken for."""
@@ -315,7 +310,7 @@ class SignatureTable:
         for i, t in enumerate(self.times):
             last = len(_edges(t)) - 1
             ends = [(a, min(a + longest, last - 1)) for a in range(1, last)]
-            pairs = [(a, b) for a, end in ends for b in range(a + FEWEST_BLOCKS, end + 1)]
+            pairs = [(a, b) for a, end in ends for b in range(a + 1, end + 1)]
             edges = _edges(t)  # no push lasts for what was left out between two stretches
             pairs = [(a, b) for a, b in pairs if edges[b] - edges[a] < LONGEST_CONTACT_S + BLOCK_S]
             leads += self._best_intervals(i, candidates, pairs, passing=True)

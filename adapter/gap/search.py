@@ -41,18 +41,13 @@ from adapter.gap.scan import (
     least_chi2,
 )
 
-TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
-CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 8, 0.0  # names that are exchanged for better ones, and by how much
 LOST = 1.2  # times the residual that a simpler name may leave
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
-CLEAR = 3.0  # standard deviations of a force
-WEIGHTLESS = 1e-9  # m/s², least gravity
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
 FALLS_CHI2 = 4.0  # that friction which falls with the speed must say more to be looked at closely
 RESOLVED_CHI2 = 4.0  # that bristles must be better than friction that slides at once
-SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
 
@@ -171,7 +166,7 @@ def _round(
             x.interval_s == WHOLE and any(e.covers(x.candidate) for e in there) for x in move.leads
         )
     ]
-    for move in moves[:TRIED]:
+    for move in moves[:3]:  # moves of a round
         again = _dated_anew_beside(fit, move)
         if again is not None:
             return again, True
@@ -179,7 +174,7 @@ def _round(
         if trial is not None:
             taken = {move.joint, -1}  # plain moves of other joints do not touch this one
             for other in moves:
-                if other.joint in taken or other.log_evidence < BELIEF + SURE_NATS:
+                if other.joint in taken or other.log_evidence < BELIEF + 20.0:  # or less sure
                     continue
                 taken.add(other.joint)  # the best move of a joint decides, whatever it is
                 if other.plain:
@@ -232,7 +227,7 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
         own = [c for c in table.candidates if c.joint == joint and isinstance(c.effect, Pattern)]
         patterns = [table.lead_of(c) for c in own]
         best = max(map(table.honest, patterns), key=lambda x: x.chi2)
-        if named.chi2 < (CURVE_SHARE if curve else PATTERN_SHARE) * best.chi2:
+        if named.chi2 < (1.1 if curve else PATTERN_SHARE) * best.chi2:  # two words for one curve
             fit = _with(bare, Move((best,), best.log_evidence), table.fit.noise) or fit
     return fit
 
@@ -389,13 +384,13 @@ def _stands_out(fit: Fit, carried: Carried, k: int) -> bool:
     force, doubt = fit.coefficients[own], honest_covariance(fit, carried)[np.ix_(own, own)]
     if fit.named[k].interval_s == WHOLE:
         gravity = fit.model.arm.gravity
-        down = gravity / max(float(np.linalg.norm(gravity)), WEIGHTLESS)
+        down = gravity / max(float(np.linalg.norm(gravity)), 1e-9)  # m/s², least gravity
         aside = force - (force @ down) * down
         if aside @ aside < (force @ down) ** 2:
             return False
         force = aside
     square = float(force @ force)
-    return square**2 > CLEAR**2 * float(force @ doubt @ force)
+    return square**2 > 3.0**2 * float(force @ doubt @ force)  # standard deviations
 
 
 def _swapped(fit: Fit, standings: Sequence[Standing], unnamed: Container[int]) -> Fit | None:

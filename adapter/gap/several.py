@@ -29,7 +29,6 @@ from adapter.model.spatial import Array
 LINK_STD = (5.0, *[0.5] * 3, *[0.15] * 6)  # of what a link may differ by: kg, kg m, kg m2
 FRICTION, OFFSET, LINK = "friction", "offset", "link"
 NOISE, OTHERS = 4.5, 2.5  # of the noise, and of the largest among all others: more is another arm
-FEWEST = 3  # recordings: of two nobody can say which one is the odd one
 
 
 class Difference(NamedTuple):
@@ -193,7 +192,7 @@ def contradictions(fit: Fit, together: Together) -> list[Difference]:
     """
     out: list[Difference] = []
     std, places = np.diagonal(together.prior) ** -0.5, list(range(len(together.parts)))
-    while len(places) >= FEWEST:
+    while len(places) >= 3:  # of two nobody can say which one is the odd one
         odd = _odd_one(fit, [together.parts[i] for i in places], std)
         if odd is None:
             break

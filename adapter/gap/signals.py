@@ -38,41 +38,33 @@ DECIMATION = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
 TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
-BAND_MARGIN = 1.3  # of a torque's band, over where it no longer stands out of noise
 CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at least
-MASSES = 20  # instants at which the mass matrix is asked for
-MANY = 100  # signals that are worth a look whether some are zero
 LEAST_S = 1.2  # of a recording, and of a stretch between pauses
-HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 
-RARELY = 25  # rows of the band, a second
 
 # Splines through a motion.
 SPLINE_DEGREE = 5
 KNOT_S = 0.02  # a joint does nothing that we model within 40 ms
 Q_NOISE_FLOOR, DQ_NOISE_FLOOR = 2e-6, 2e-5  # rad, rad/s: of signals without noise
-STIFFNESS = (-16.0, 6.0)  # range of ln of the penalty on the squared third derivative
 
 # A recording again, or as a forward simulation takes it.
 COMMANDS, MEASURED = "commands", "measured"
 ROLLOUT_STEP_S = 1e-3
 SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; compared so often
 SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
-COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
 UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
 FAR_S = 0.05  # a command older than that does not drive any more
-HOLE_S = 0.05  # between samples: what happened in there is not known
 ROLLOUT_EDGE_S = 0.3
 
 
 def low(x: Array) -> Array:
     """Signals (m, ...) at 250 Hz in the band, (k, ...) at 25 Hz; the ends are left out."""
     flat, shape = x.reshape(len(x), -1), x.shape[1:]
-    if flat.shape[1] > MANY:  # half of a regressor is zero
+    if flat.shape[1] > 100:  # half of a regressor is zero
         used = flat.any(axis=0)
         if not used.all():
             out = np.zeros((_size_of_low(len(x)), flat.shape[1]))
@@ -145,11 +137,9 @@ class Signals:
 
     def low_of(self, make: Callable[[slice], Array]) -> Array:
         """The same of what is made stretch by stretch: at the motion's rate it may be large."""
-        parts = [self._trimmed(low(make(rows))) for rows in self.stretches]
+        parts = [low(make(rows)) for rows in self.stretches]
+        parts = [x[self.trim : len(x) - self.trim] for x in parts] if self.trim else parts
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _trimmed(self, x: Array) -> Array:
-        return x[self.trim : len(x) - self.trim] if self.trim else x
 
     def low_on(self, x: Array, joint: int) -> Array:
         """A torque (m, n) that acts on one joint (-1: on all) in the band (k, n)."""
@@ -189,7 +179,7 @@ class Signals:
     @property
     def sliding(self) -> Array:
         """(k, n) one there, else zero; where a joint hardly slides, all that is measured."""
-        return np.where(self.slides.sum(axis=0) < RARELY, self.heard, self.slides)
+        return np.where(self.slides.sum(axis=0) < 25, self.heard, self.slides)  # rows: a second
 
     @cached_property
     def slowness(self) -> Array:
@@ -246,7 +236,7 @@ def in_band(motion: Motion, noise: Array, tau: Array, known: Array, trim: int = 
     if motion.bands_hz is None:
         motion = replace(motion, bands_hz=bands_of(motion, noise))
     at = slice(TAPS // 2, -(TAPS // 2), DECIMATION)
-    heard = (minimum_filter1d(known, TAPS, axis=0)[at] > HEARD).astype(float)
+    heard = (minimum_filter1d(known, TAPS, axis=0)[at] > 0.999).astype(float)  # all of it
     own, t, heard = (x[trim : len(x) - trim] for x in (low(tau), motion.t[at], heard))
     return Signals(motion, noise, own, t, heard, trim=trim)
 
@@ -270,7 +260,7 @@ def bands_of(motion: Motion, noise: Array) -> Array:
     Infinite where it does as far as torques are compared. `noise` is (n,) rad²/s²/Hz, of dq.
     """
     arm = motion.arm
-    some = motion.q[:: max(len(motion.q) // MASSES, 1)]
+    some = motion.q[:: max(len(motion.q) // 20, 1)]  # instants for the mass matrix
     rest = np.zeros_like(some)
     held = arm.torque(some, rest, rest)
     mass = [arm.torque(some, rest, rest + unit) - held for unit in np.eye(arm.n)]
@@ -283,7 +273,7 @@ def bands_of(motion: Motion, noise: Array) -> Array:
     clear = np.cumsum(power[::-1], axis=0)[::-1] > CLEAR * theirs
     clear &= (f <= f[-1] - TOP_HZ)[:, None]
     last = len(f) - 1 - np.argmax(clear[::-1], axis=0)
-    band = np.where(f[last] + 2.0 * f[1] > f[-1] - TOP_HZ, math.inf, BAND_MARGIN * f[last])
+    band = np.where(f[last] + 2.0 * f[1] > f[-1] - TOP_HZ, math.inf, 1.3 * f[last])  # a margin
     return np.where(clear.any(axis=0), band, 0.0)
 
 
@@ -411,7 +401,7 @@ class Recorded:
         """Whether there are samples all the way between two of its times."""
         first, last = np.searchsorted(self.t, (begin_s, end_s))
         around = self.t[max(first - 1, 0) : last + 1]
-        return bool(len(around) > 1 and np.diff(around).max() < HOLE_S)
+        return bool(len(around) > 1 and np.diff(around).max() < 0.05)  # no hole in between
 
     def drive(self, t: Array) -> tuple[Array, str]:
         """Torque (m, n) that moved the arm at times t, and which of `COMMANDS`, `MEASURED` it is.
@@ -431,7 +421,7 @@ class Recorded:
         """Commands (m, n) at times t; None where there are none for part of the time."""
         if self.command_t is None or self.commands is None or len(self.command_t) < 2:
             return None
-        at = self.command_t + COMMAND_DELAY_S
+        at = self.command_t + 1e-3  # it is reached at the end of the next period
         inside = at[(at > t[0] - FAR_S) & (at < t[-1] + FAR_S)] if len(t) else at[:0]
         if len(inside) < 2 or inside[0] > t[0] + FAR_S or inside[-1] < t[-1] - FAR_S:
             return None
@@ -498,7 +488,7 @@ def smoothness_of(parts: Sequence[Splines]) -> Smoothness:
         costs = [_cost_of(*part.known(j, q_noise[j], dq_noise[j]), part.rough) for part in parts]
         best = minimize_scalar(
             lambda x, costs=costs: sum(cost(x) for cost in costs),
-            bounds=STIFFNESS,
+            bounds=(-16.0, 6.0),  # range of ln of the penalty on the squared third derivative
             method="bounded",
             options={"xatol": 0.2},
         )

@@ -15,10 +15,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from adapter.gap.evidence import Carried
-from adapter.gap.fit import Fit
+from adapter.gap.fit import BLOCK, Fit
 from adapter.model.spatial import Array
-
-BLOCK = 25  # samples at 25 Hz: errors of the model last so long, noise does not
 
 
 @dataclass(frozen=True, eq=False)

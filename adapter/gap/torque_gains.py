@@ -39,11 +39,8 @@ from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log
 
 DOCUMENTED_STD, WEIGHED_STD = 0.1, 0.2  # of the inertias: alone, and beside a known mass
-GAIN_STD = 0.5  # of a gain, as a share of what one joint's regression says
 KNOWN_SHARE = 1e-3  # to which a known mass is weighed
 ROUNDS, NOISE_ROUNDS, STEPS = 3, 3, 4  # of the whole; of noise after fit; of each fit
-SETTLED = 2e-3  # share of a gain that ends the rounds
-SHOWN_SHARE = 0.25  # one standard deviation, above which a gain is not shown
 LEARNED_SHARE = 2.0 / 3.0  # of every recording, for the check on the rest
 SLIDES_RAD_S, AROUND_S = 0.1, 0.1  # slower, so long before or after, a joint sticks
 GAIN = CATALOGUE["torque_gain"]
@@ -186,7 +183,7 @@ def learn_gains(
     first, fit, _ = _fitted(replace(task, recordings=tuple(begun)), start)
     held_out, size = _on_the_rest(task, fit, first)
     gain, fit, std = _fitted(task, first)
-    shown = std < SHOWN_SHARE * np.abs(gain)
+    shown = std < 0.25 * np.abs(gain)  # one standard deviation, above which a gain is not shown
     if shown.any():
         gain = np.where(shown, gain, np.median(gain[shown]))
     moved = float(np.abs(first / gain - 1.0)[shown].max(initial=0.0))
@@ -212,7 +209,7 @@ def _fitted(task: _GainTask, gain: Array) -> tuple[Array, Fit, Array]:
     """Gains (n,), the fit in N m under them, and their standard deviations (n,)."""
     n, known = len(gain), task.load_kg if any(task.loaded) else None
     std, own = (DOCUMENTED_STD if known is None else WEIGHED_STD), GAIN.templates()[0]
-    wide = Template((GAIN_STD,), own.decode, own.label)
+    wide = Template((0.5,), own.decode, own.label)  # of what one joint's regression says
     # of joints whose torque tells one; of all where a known load makes torque in every joint
     joints = range(n) if known is not None else np.flatnonzero(task.tells).tolist()
     gains = [Named(Candidate(GAIN, wide, int(j), ()), np.zeros(1)) for j in joints]
@@ -230,7 +227,7 @@ def _fitted(task: _GainTask, gain: Array) -> tuple[Array, Fit, Array]:
         step = np.zeros(n)
         step[at] = fit.coefficients[off]
         gain = gain / (1.0 + step)
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < 2e-3:  # share of a gain that ends the rounds
             break
     doubt = np.full(n, np.inf)
     covariance = honest_covariance(fit, carried)

@@ -17,7 +17,6 @@ from adapter.gap.scan import BELIEF, SignatureTable, least_chi2
 from adapter.gap.search import Found
 from adapter.model.spatial import Array
 
-WIDEST = 20.0  # times its prior: nothing is so large
 SURELY = 1.3  # standard deviations: of effects so much larger noise hides one in ten
 STEP, OPEN = 1e-3, 100.0  # of a coefficient's prior: for slopes; how wide it is taken here
 
@@ -70,7 +69,7 @@ def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen | None:
     at = std / np.arange(1, len(std) + 1)
     slope = np.array([value(at + x) - value(at) for x in STEP * np.diag(std)]) / (STEP * std)
     size = (np.sqrt(asked) + SURELY) * np.sqrt(slope @ covariance @ slope)
-    if size > WIDEST * np.linalg.norm(slope * std):
+    if size > 20.0 * np.linalg.norm(slope * std):  # times its prior: nothing is so large
         return None
     above = len(std) == 1 and slope[0] < 0.0  # what is stiff does not show
     if above:

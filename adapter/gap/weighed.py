@@ -17,18 +17,15 @@ from adapter.gap.folds import FOLDS, block_s, fold_of
 from adapter.gap.long_recording import LongRecording
 from adapter.gap.search import Found
 
-STEPS = 2  # of Gauss and Newton where the model is not linear
-NEAR = 0.3  # standard deviations: a step that needs no further one
-
 
 def weighed(found: Found, whole: LongRecording) -> Found:
     """What was found in some stretches of a recording, fitted to all of it."""
     under = found.under or found.fit
-    for _ in range(STEPS):
+    for _ in range(2):  # of Gauss and Newton where the model is not linear
         moments = moments_of(under, whole)
         step = np.abs(moments.x - under.coefficients) / moments.std()
         under = under.at(moments.x)
-        if under.is_linear or step.max() < NEAR:
+        if under.is_linear or step.max() < 0.3:  # standard deviations: no further step is needed
             break
     fit, known = found.fit.at(moments.x), None
     if found.known is not None:

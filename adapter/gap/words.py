@@ -184,7 +184,8 @@ def left_above_noise(result: GapResult) -> str:
 
 def _nothing(result: GapResult) -> str:
     said = "the model explains " + data_words(result)
-    before, after = (_largest(times) for times in noise_times(result))
+    known = (times[np.isfinite(times)] for times in noise_times(result))
+    before, after = (float(times.max(initial=0.0)) for times in known)
     if after > ABOVE_NOISE:
         return (
             f"no effect of the catalogue is called for; the model explains {data_words(result)} "
@@ -193,11 +194,6 @@ def _nothing(result: GapResult) -> str:
     if before > ABOVE_NOISE:
         return f"{said} down to its noise once its inertias are corrected by what its prior allows"
     return f"{said} down to its noise"
-
-
-def _largest(ratio: np.ndarray) -> float:
-    known = ratio[np.isfinite(ratio)]
-    return float(known.max()) if known.size else 0.0
 
 
 def _finding_parts(findings: Sequence[Finding]) -> list[str]:

@@ -65,14 +65,6 @@ from drivers.files.mcap import Log, read_log
 
 SEARCHED_S = 20.0  # of several recordings
 NO_NAME = 0.5  # probability below which an effect is not told by name
-UNPLACED = (
-    "the inertias were corrected by more than 4 prior standard deviations; which link it is, these "
-    "data do not tell"
-)
-ASSUMED = (
-    "the model has what any arm has (friction, motor inertia, offsets) where these data do not "
-    "single it out, too: it is not told by name"
-)
 FIT_S, SCORE_S = 3.0, 2.0  # the least of a recording that is fitted; and scored
 
 Progress = Callable[[str], None]
@@ -355,9 +347,15 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     notes += notes_on(found.fit)
     placed = any(KNOWN[f.effect].is_theta for f in findings)
     if np.abs(found.fit.dtheta / trusted).max() > ODD and not placed:
-        notes.append(UNPLACED)
+        notes.append(
+            "the inertias were corrected by more than 4 prior standard deviations; which link it "
+            "is, these data do not tell"
+        )
     if found.weak:
-        notes.append(ASSUMED)
+        notes.append(
+            "the model has what any arm has (friction, motor inertia, offsets) where these data do "
+            "not single it out, too: it is not told by name"
+        )
     splits = (x for f in findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,

@@ -35,14 +35,13 @@ EFFECT_STD = {  # the same, of the effects' parameters
     "motor_inertia": MOTOR_KG_M2,
     "joint_spring": SPRING_NM_RAD,
 }
-SHOWN_SHARE = 0.5  # of its prior's standard deviation: what is known no better was not shown
 SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `documented_std`
 
 
 def is_shown(effect: str, key: str, std: float | None) -> bool:
     """Whether data told a parameter of an effect, and not its prior alone."""
     known = effect in EFFECT_STD and key == LEARNED[effect].key
-    return std is None or not known or std < SHOWN_SHARE * EFFECT_STD[effect]
+    return std is None or not known or std < 0.5 * EFFECT_STD[effect]  # or it was not shown
 
 
 def prior_std(theta: Array, share: float = DOCUMENTED_SHARE) -> Array:

@@ -14,7 +14,6 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 
 BURST_BLOCK = 500  # samples
-PAUSE = 500  # samples until the next look, where an error was nothing that a hand carries
 BEYOND = 1.5  # times the fastest that was seen: a velocity is new
 
 
@@ -167,7 +166,7 @@ class ChangeDetector:
             self._block = np.maximum(self._block, (most, mean))
             return False
         if not explained():
-            self._armed_at = self.samples + PAUSE
+            self._armed_at = self.samples + 500  # no hand carries such
             return False
         self._armed_at = self.samples + self.settings.rearm_after
         self.recent[:] = 0.0

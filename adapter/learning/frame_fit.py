@@ -23,15 +23,9 @@ from adapter.physics.freedom import Freedom
 
 # Eigenvalues of the curvature below this, relative to the largest, are rounding.
 RELATIVE_CURVATURE = 1e-10
-# Singular values of Wahba's matrix below this, relative to the largest: what shows no more than
-# one direction leaves the turn about it open.
-OPEN_ROTATION = 1e-3
-OPEN_TURNS = 8  # tried about it
 STEPS = 60  # of Gauss-Newton; from Wahba's rotation 4 are enough, from a far start 20
 SMALLEST_STEP = 1e-13  # rad, m: close to the rounding of a frame
 LONGEST_TURN = 1.0  # rad a step
-HALVINGS = 12
-COST_ROUNDING = 1e-12  # of a cost, relative to the signals' power
 SAME_COST = 1e-9  # costs this close, relative to the signals' power, can't be told apart
 
 
@@ -118,10 +112,10 @@ def descend(
     frame = start
     cost, gradient, curvature = slope_and_curvature(sums, weights, frame)
     # Close to a minimum without noise the cost is the rounding of large sums and judges no step.
-    rounding = COST_ROUNDING * weighted_power(sums, weights)
+    rounding = 1e-12 * weighted_power(sums, weights)  # of a cost, relative to the signals' power
     for _ in range(STEPS):
         step = _newton_step(frame, gradient, curvature, freedom)
-        for _ in range(HALVINGS):
+        for _ in range(12):
             trial = frame.moved(step)
             found = slope_and_curvature(sums, weights, trial)
             if found[0] <= cost + rounding:
@@ -155,9 +149,11 @@ def first_frames(sums: Array, weights: Array, prior: Frame) -> list[Frame]:
     best = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     if values[0] == 0.0:
         return [prior]
-    if values[1] > OPEN_ROTATION * values[0]:
+    # Singular values of Wahba's matrix below this, relative to the largest: what shows no more than
+    # one direction leaves the turn about it open.
+    if values[1] > 1e-3 * values[0]:
         return [Frame(best, prior.p.copy())]
-    about = np.linspace(0.0, 2.0 * np.pi, OPEN_TURNS, endpoint=False)[:, None] * u[:, 0]
+    about = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)[:, None] * u[:, 0]  # tried about it
     return [Frame(turn @ best, prior.p.copy()) for turn in exp_rotation(about)]
 
 

@@ -32,12 +32,8 @@ from adapter.model.tree import BASE, Tree
 # sensor's place (m), biases (rad/s, m/s²) and the lateness of its stamps (s).
 FRAME_STD, PLACE_STD, W_BIAS_STD, A_BIAS_STD, LATE_STD = 0.3, 1.0, 0.1, 1.0, 0.05
 OWN = 13  # unknowns of a sensor: turn, place, biases of w and a, lateness
-MAINLY = 0.3  # of a gauge's step; a frame that it moves by more is said not to be known along it
 LEAST_STD = 1e-9  # rad/s, m/s²: no sensor is trusted more
 WILD = 6.0  # standard deviations; a window that is further off is not believed
-STEPS = 30
-SMALL_STEP = 0.1  # in standard deviations, of all unknowns together: has arrived
-COST_ROUNDING = 1e-9
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1.0
 
 
@@ -215,20 +211,20 @@ class ImuFit:
         """Gauss-Newton from `at`, damped where a step does not lower the cost."""
         damping = 0.0
         stds, slope = self._slope(at, prior)
-        for _ in range(STEPS):
+        for _ in range(30):
             free = self._free(at)
             H = free.T @ slope.curvature @ free
             damped = H + damping * np.diag(H.diagonal())
             step = -free @ np.linalg.solve(damped, free.T @ slope.gradient)
             trial = at.moved(step)
-            if self._cost(trial, stds, prior) > slope.cost * (1.0 + COST_ROUNDING):
+            if self._cost(trial, stds, prior) > slope.cost * (1.0 + 1e-9):
                 damping = max(10.0 * damping, FIRST_DAMPING)
                 if damping > MOST_DAMPING:
                     break
                 continue
             at, damping = trial, 0.1 * damping if damping > FIRST_DAMPING else 0.0
             stds, slope = self._slope(at, prior)
-            if float(step @ slope.curvature @ step) < SMALL_STEP**2:
+            if float(step @ slope.curvature @ step) < 0.1**2:  # in standard deviations
                 break
         free = self._free(at)
         covariance = free @ np.linalg.inv(free.T @ slope.curvature @ free) @ free.T
@@ -420,7 +416,7 @@ def told_apart(tree: Tree, gravity: Array, at: Estimate) -> list[Array]:
     for j in range(tree.n):
         hidden = np.zeros((6, 2))
         hidden[2, 0], hidden[3:, 1] = 1.0, at.R0[j, :, 2]
-        mainly = gauge[j][:, np.linalg.norm(gauge[j], axis=0) > MAINLY]
+        mainly = gauge[j][:, np.linalg.norm(gauge[j], axis=0) > 0.3]  # a step moves it so far
         whole, _ = np.linalg.qr(np.concatenate([hidden, mainly], axis=1), mode="complete")
         found.append(whole[:, 2 + mainly.shape[1] :])
     return found

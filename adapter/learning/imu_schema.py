@@ -21,12 +21,7 @@ from adapter.signals.records import KIND, LinkMotionKind, stamps_of
 from drivers.errors import choices
 
 FIRST_S, GROWTH, MOST_S = 1.0, 1.25, 4.0  # of motion: first solution, and from one to the next
-HELD_S = 60.0  # of readings; the older half of more becomes a paraboloid
-LAST_WORD = 100  # updates without a new reading: what is left is solved, too
 SLOWEST_HZ = 40.0
-FEWEST = 20  # readings of a sensor
-SHOWN = 10.0  # times what the springs say
-ASTRAY = 0.2  # of how a sensor turns; one that is off by more is not on that link, or mad
 SURE = 2.0  # standard deviations that λ may move from one solution to the next
 HEARD, W, A = 0, slice(3, 6), slice(6, 9)  # of the motion row of a link
 
@@ -101,7 +96,7 @@ class ImuSchema(Schema):
         self._waiting += 1
         more_s, known_s = self._moved_s - self._solved_s, self._solved_s
         due_s = min(max(FIRST_S, (GROWTH - 1.0) * known_s), MOST_S)
-        if more_s >= due_s or (more_s > 0.0 and self._waiting > LAST_WORD):
+        if more_s >= due_s or (more_s > 0.0 and self._waiting > 100):  # no more is coming
             self._solved_s = self._moved_s
             self._solve()
 
@@ -135,7 +130,7 @@ class ImuSchema(Schema):
         prior = self._prior or Prior.springs(Estimate.of(*frames, self._at.turn))
         found = fit.solve(prior, self._at)
         self._take(found)
-        if readings.t_s[-1] - readings.t_s[0] > HELD_S:
+        if readings.t_s[-1] - readings.t_s[0] > 60.0:  # the older half becomes a paraboloid
             old = len(rows) // 2
             half = self._fit_of(Readings(*(x[:old] for x in readings)))
             self._prior = half.known(prior, found.estimate)
@@ -172,7 +167,7 @@ class ImuSchema(Schema):
             own = slice(6 * j, 6 * j + 6)
             values, vectors = np.linalg.eigh(basis.T @ found.covariance[own, own] @ basis)
             vectors = basis @ vectors
-            shown = values < FRAME_STD**2 / SHOWN
+            shown = values < FRAME_STD**2 / 10.0  # times what the springs say
             certain = shown & (values < self.settings.std_goal**2)
             self._covariance[j] = (vectors[:, shown] * values[shown]) @ vectors[:, shown].T
             self.identifiable[j] = vectors[:, shown] @ vectors[:, shown].T
@@ -187,7 +182,7 @@ class ImuSchema(Schema):
             f"the sensor on {name} turns otherwise than {name} of the model does (off by "
             f"{100.0 * share:.0f} % of how it turns); which link is it on?"
             for name, share in zip(names, found.w_share, strict=True)
-            if share > ASTRAY
+            if share > 0.2  # it is not on that link, or mad
         ]
         calm &= not self._astray and bool(ranks.any()) and bool((ranks == self.ranks).all())
         self.rank, self.ranks[:] = int(np.einsum("jaa->", self.identifiable).round()), ranks
@@ -227,7 +222,7 @@ class ImuSchema(Schema):
 
 def _wrong(t_s: Array, told: Array) -> str | None:
     """Why readings (k, 6) of a sensor cannot be used; None where they can."""
-    if len(t_s) < FEWEST:
+    if len(t_s) < 20:  # readings of a sensor
         return f"was heard {len(t_s)} times"
     rate = 1.0 / float(np.median(np.diff(t_s)))
     if rate < SLOWEST_HZ:

@@ -24,7 +24,6 @@ KNOT_S = 0.06  # between two knots of the bell, and from one window to the next
 DEGREE = 5  # so smooth that sums over the grid are integrals to 1e-6
 LONGEST_GAP_S = 0.05  # no window spans a longer silence
 LONGEST_PERIODS = 3.0  # nor one of more than so many periods
-FASTEST_HZ = 200.0  # faster signals are averaged to about this rate first
 PER_KNOT = round(KNOT_S / STEP_S)
 
 
@@ -57,7 +56,7 @@ class Course:
 
         period_s = float(np.median(np.diff(t_s)))
         self._longest_s = max(LONGEST_GAP_S, LONGEST_PERIODS * period_s)
-        count = int(1.0 / (FASTEST_HZ * period_s) + 1e-6)
+        count = int(1.0 / (200.0 * period_s) + 1e-6)  # faster signals are averaged to this
         if count > 1:  # averages of so many readings; none across a gap
             part = np.cumsum(np.diff(t_s, prepend=t_s[0]) > LONGEST_PERIODS * period_s)
             start = np.flatnonzero(np.diff(part, prepend=-1))

@@ -20,12 +20,6 @@ from adapter.physics.kernels import JointMotion, jit
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns, stamps_of
 
-LONGEST_STEP_NS = 20_000_000  # between two states that a rate is taken from
-# On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's torque:
-# 0.10 N m without smoothing, 0.01 with.
-TWIST_SMOOTHING_S = 0.03
-SMALLEST_STD = 1e-3  # of the effect's own; a model that is surer than that is not believed
-
 
 @jit
 def to_joints(stamps, table, sensors, gears, clock, memory):
@@ -47,7 +41,7 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
         q, dq = table[m, at.q : at.dq], table[m, at.dq : at.ddq]
         ddq, tau = table[m, at.ddq : at.tau], table[m, at.tau : at.base]
         step = stamps[m] - clock[0]
-        if step <= 0 or step > LONGEST_STEP_NS:
+        if step <= 0 or step > 20_000_000:  # between two states that a rate is taken from
             clock[1] = 0
         dt = 1e-9 * step
         for j in range(n):
@@ -55,7 +49,9 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
             # the second rate of torque is small against its noise: followed slowly
             newest = (rate[j] - memory[1, j]) / dt if clock[1] >= 2 else 0.0
             old = memory[3, j] if clock[1] >= 2 else 0.0
-            memory[3, j] = old + (newest - old) * dt / (dt + TWIST_SMOOTHING_S)
+            # On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's
+            # torque: 0.10 N m without smoothing, 0.01 with.
+            memory[3, j] = old + (newest - old) * dt / (dt + 0.03)
             jerk[j] = memory[3, j]
             memory[0, j], memory[1, j] = tau[j], rate[j]
             if clock[1] == 0:  # before it is known better, the motor pushes the way it moves
@@ -107,7 +103,7 @@ def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Arr
             std = active.std.get(effect.key) if effect is active.effect else None
             widest = effect.learned_std
             known_to = None if std is None or not np.isfinite(std) else float(std)
-            spread = widest if known_to is None else max(known_to, SMALLEST_STD * widest)
+            spread = widest if known_to is None else max(known_to, 1e-3 * widest)  # not surer
             total[at] += value
             variance[at] = np.nan_to_num(variance[at]) + spread**2
     told = np.isfinite(variance)
@@ -141,12 +137,10 @@ class KnownEffects:
         n = arm.n
         self._layout, self._arm, self._smoothing_s = StateLayout(n), arm, smoothing_s
         self._own = own = by_joint(effects, n)
-        self._sensors = own.half_play, own.gain, own.delay_s
         self._gears = Gears.of(own)
         turned = own.offset.any() or own.ripple.any()
         self._encoders = self._gears._replace(compliance=np.zeros(n)) if turned else None
         self._sensed = own.moves or bool(own.gain.any() or own.delay_s.any())
-        self._by_load = own.by_load
         self.clock, self.memory = np.zeros(2, dtype=np.int64), np.zeros((4, n))
         self.left_out = own.left_out
         self.take_off(self._layout.new(1))  # compiled now, not at the first state
@@ -162,12 +156,13 @@ class KnownEffects:
         table = table.copy()
         if self._sensed:
             stamps = stamps_of(table)
-            to_joints(stamps, table, self._sensors, self._gears, self.clock, self.memory)
+            sensors = own.half_play, own.gain, own.delay_s
+            to_joints(stamps, table, sensors, self._gears, self.clock, self.memory)
         q, tau = table[:, at.q], table[:, at.tau]
         if own.pushed:
             tau += self._arm.wrench_torque(q, own.wrench)
         signals = at.signals(table, self._smoothing_s)
-        if self._by_load:
+        if own.by_load:
             signals = signals._replace(tau=tau - own.torque(signals))
         if own.laws:
             tau -= own.torque(signals)

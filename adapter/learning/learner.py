@@ -31,17 +31,10 @@ from adapter.physics.kernels import Frames, JointMotion, base_at_rest, jit, regr
 from adapter.signals.records import StateLayout, stamp_of, stamps_of
 
 JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
-NOISE_STATES = 5000  # newest ones, whose errors tell for how long the noise keeps its sign
 AHEAD = 100  # states that are looked at for one call of `steps`
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
-RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
-REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
-# Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up in
-# motion, 0.88 at most where friction turned around).
-LOAD_SHARE = 0.95
-NEW_SHARE = 0.5  # of an error's power at velocities that are new: it is of those
 MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
 
 
@@ -365,7 +358,7 @@ class OnlineLearner:
 
     def posterior(self) -> LearnedPosterior:
         """What is known of θ and the effects by all states so far."""
-        rows = np.arange(max(self._held_from, self._held_to - NOISE_STATES), self._held_to)
+        rows = np.arange(max(self._held_from, self._held_to - 5000), self._held_to)  # newest
         held, memory = self._held[rows % len(self._held)], None
         if len(held) > 1:
             apart_s = 1e-9 * float(np.median(np.diff(stamps_of(held))))
@@ -470,7 +463,7 @@ class OnlineLearner:
         """Add states to θ's moments; whether θ may be stepped on."""
         if self.rates is not None:
             # until θ has seen enough they count as zero, and nothing has to wait for them
-            self._rates_known = self._rates_known or self.theta.count >= RATES_FROM
+            self._rates_known = self._rates_known or self.theta.count >= 1500  # samples
             if self._rates_known:
                 table = self.rates.follow(table, self.frames, self.theta.theta, self.base)
         self._torque_states = table
@@ -539,11 +532,13 @@ class OnlineLearner:
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
         power, seen = np.square(error / size), self.rates_seen
         new = is_new(table[:, at.dq.start : at.ddq.stop], seen)
-        if len(seen) and power[new].sum() > NEW_SHARE * power.sum():
+        if len(seen) and power[new].sum() > 0.5 * power.sum():  # they are of what is new
             return False
         begin = self.theta.hand.start
         load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
-        return explained_share(load, error / size) > LOAD_SHARE
+        # Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up
+        # in motion, 0.88 at most where friction turned around).
+        return explained_share(load, error / size) > 0.95
 
     @property
     def rates_seen(self) -> Array:
@@ -572,7 +567,7 @@ class OnlineLearner:
     def _strayed(self) -> bool:
         """Whether λ has left the frames of θ's moments by more than it is sure of."""
         std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
-        allowed = np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
+        allowed = np.maximum(self.settings.rebuild_stds * std, 1e-5)  # rad, m: no sensor shows it
         return self.schema.strayed(*self.frames, allowed)
 
     def _begin_rebuild(self) -> None:

@@ -51,19 +51,10 @@ from adapter.model.tree import Tree
 from adapter.signals.filters import THIRD_DIFFERENCE_GAIN
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, stamp_of
 
-PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift alone
 # Curvature that counts as shown, and as known, where nothing but rounding (some 1e-6) disturbs it.
 SHOWN_EXACTLY, KNOWN_EXACTLY = 1.0, 1.6e5
 NEAR = 2.5e-3  # rad, m: from where the curvature alone finds the way, where nothing disturbs it
-SURE = 3.0  # standard deviations that may be left in directions that are not known yet
-# Times that λ has to stand still for where something shown is not known yet. Without noise that is
-# soon over, unless a brake holds a joint.
-PATIENCE = 5
 LONGEST_WAIT_NS = 50_000_000  # what counts of the time between two looks at a λ that stands still
-SETTLED_LOOK_NS = LONGEST_WAIT_NS  # between two looks at a λ that has converged
-EXACT_DISTANCE = 1e-6  # rad, m: what may be left to the optimum of motion without noise
-FEWEST_DIFFERENCES = 50  # third differences that say something of the noise
-LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none
 # Where dw is carried by λ: samples between two looks at λ, and the turn (rad) in between that
 # spoils them.
 CARRIED_SAMPLES, CARRIED_TURN = 400, 2e-3
@@ -134,7 +125,7 @@ class Schema:
             np.zeros((newest, 3, 15, 15)),
             np.zeros((n + 1, 4)),
             np.zeros((3, n + 1, 12)),
-            np.array([LONG_AGO_NS, 2**62]),
+            np.array([-(2**61), 2**62]),  # before any stamp: the first sample follows none
             np.zeros(len(Count)),
         )
         self._moments = tuple(self.moments)
@@ -219,7 +210,7 @@ class Schema:
 
     def _look_due(self, stamp_ns: int) -> bool:
         """Whether curvature is looked at with a state of this stamp, where it may be."""
-        return not self.converged or not 0 < stamp_ns - self._looked_ns < SETTLED_LOOK_NS
+        return not self.converged or not 0 < stamp_ns - self._looked_ns < LONGEST_WAIT_NS
 
     def parts(self) -> tuple[Any, ...]:
         """What `steps` needs of it."""
@@ -268,7 +259,7 @@ class Schema:
         noise.
         """
         moments, differences = self.moments, self.moments.counts[Count.DIFFERENCES]
-        if self.kind != LinkMotionKind.MEASURED or differences < FEWEST_DIFFERENCES:
+        if self.kind != LinkMotionKind.MEASURED or differences < 50:  # too few to tell
             return np.zeros_like(moments.noise_power)
         found = moments.noise_power / (THIRD_DIFFERENCE_GAIN * differences)
         left = np.empty((len(self.p), 3))
@@ -341,7 +332,7 @@ class Schema:
     def _judge(self) -> None:
         """Which directions the data show, how far the optimum is, whether λ has settled."""
         curvature, before = np.linalg.eigh(self.information), self.ranks.copy()
-        stds = (0.0, 0.0) if self._exact else (1.0, SURE)
+        stds = (0.0, 0.0) if self._exact else (1.0, 3.0)  # standard deviations that may be left
         goals = self.settings.distance_goal, *stds
         out = self._may_move, self._inverse, self._left, self.ranks, self._there
         self.rank = directions(tuple(curvature), self._limits, goals, self.gradient, out)
@@ -361,7 +352,7 @@ class Schema:
             # Steps keep out of shifts that the data do not show, but while noise still tilts the
             # picture of what is shown, a little leaks into them: back to where they started.
             unshown = np.eye(6) - self.identifiable
-            pure = np.abs(unshown[:, :3, 3:]).max(axis=(1, 2)) < PURE_SHIFT
+            pure = np.abs(unshown[:, :3, 3:]).max(axis=(1, 2)) < 0.05  # hardly any turn
             leaked = np.einsum("jab,jb->ja", unshown[:, 3:, 3:], self.p - self.start_lam[:, 3:])
             self.p -= pure[:, None] * leaked
         checked = self.each_sample
@@ -371,8 +362,10 @@ class Schema:
         calm = 1e-9 * self._calm_ns / self.settings.stable_s
         settled = checked and calm >= 1.0 and not self._rough
         if self._exact:  # no noise hides for long what is shown
-            known = self.rank == self.ranks.sum() or calm >= PATIENCE
-            settled = settled and known and bool(np.abs(self._left).max() < EXACT_DISTANCE)
+            # Times that λ has to stand still for where something shown is not known yet. Without
+            # noise that is soon over, unless a brake holds a joint.
+            known = self.rank == self.ranks.sum() or calm >= 5
+            settled = settled and known and bool(np.abs(self._left).max() < 1e-6)  # rad, m
         self.converged = settled
 
     def _check_valleys(self) -> None:

@@ -23,10 +23,9 @@ from adapter.learning.frame_fit import (
 from adapter.model.spatial import Array
 
 # Logarithms of what frames leave unexplained, summed over the channels.
-LEAST_PROGRESS = 0.2  # of ADAM on its way, from one look at a joint to the next
 CLEARLY_BETTER = 0.5
-LOOKS = 20  # until a joint's turn comes again
 AGAIN = 2.0  # a joint is checked again when there are so many times the samples
+LOOKS = 20  # until a joint's turn comes again
 
 
 class Evidence(NamedTuple):
@@ -86,7 +85,7 @@ class SchemaCheck:
         misfit, before = log_misfit(known.sums, known.samples, frame), self.misfit[j]
         self.misfit[j] = misfit
         due = known.rank != self.passed_rank[j] or known.samples > AGAIN * self.passed_at[j]
-        if not due or (misfit < before - LEAST_PROGRESS and not known.still):
+        if not due or (misfit < before - 0.2 and not known.still):  # ADAM is on its way
             return None
         found = self._solved(frame, start, known, misfit)
         self.passed_at[j], self.passed_rank[j] = known.samples, known.rank

@@ -51,15 +51,12 @@ from adapter.signals.records import StateLayout
 
 # Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
 NEUTRAL_MASS = 1.0  # kg
-NEUTRAL_INERTIA = 0.02  # kg m², about every axis
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
-WIDEST_BODY = 100.0  # times these, where data say that a body is so heavy
 
 REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
 # has fallen to this share of what it may be is not there.
 REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
-SPREAD_STEPS = 50  # at each look at how large the effects are
 # Of an effect that has several shapes: the first one in use, how many are tried at a look, and by
 # what another must be better, in squares of standard deviations.
 FIRST_SHAPE, SHAPES_TRIED, SHAPE_EVIDENCE = 2, 25, 2.0
@@ -74,15 +71,11 @@ STEP_SMOOTHING = 0.6
 # What the base's wrench has to say on the links that hang on it: enough to decide what torques
 # leave open, little enough that the noise of the base's own motion bends nothing that they show.
 HANGING_SHARE = 0.03
-BASE_LEVEL_SAMPLES = 2000  # that the running mean of the base's squared errors spans
-
-SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
-LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
 
 
 def neutral_body() -> Array:
     """(10,) what is believed of a link before any data."""
-    return theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
+    return theta_from_body(NEUTRAL_MASS, np.zeros(3), 0.02 * np.eye(3))  # kg m², about every axis
 
 
 @dataclass(frozen=True)
@@ -251,7 +244,7 @@ class Theta:
         A = np.zeros(int((widths * (widths + 1) // 2).sum()))
         floating = int(self.tree.floating)
         C = np.zeros((2 * floating, len(self.rows.near), len(self.rows.base_place) + 1))
-        level = np.zeros(6 * floating), np.array([0.0, BASE_LEVEL_SAMPLES])
+        level = np.zeros(6 * floating), np.array([0.0, 2000.0])  # samples it spans
         return Moments(A, C, *level, np.zeros(self.tree.n))
 
     def absorb(self, frames: tuple[Array, Array], table: Array) -> Array:
@@ -389,10 +382,10 @@ class Theta:
         th[spare] = link
         at = np.arange(spare.start, spare.start + 4)
         mass, *moment = np.linalg.solve(H[np.ix_(at, at)], rhs[at] - H[at] @ th)
-        if mass < SMALLEST_LOAD:
+        if mass < 0.01:  # kg; below it the start after a change is the link as it was
             return
         centre = np.array(moment) / mass
-        load = theta_from_body(mass, centre, mass * LOAD_RADIUS**2 * np.eye(3))
+        load = theta_from_body(mass, centre, mass * 0.03**2 * np.eye(3))  # m, of gyration
         if min_eigenvalue(link + load) <= 0.0:
             return
         self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
@@ -495,7 +488,7 @@ class Theta:
         shown = pulled < 0.5
         away = np.where(shown, x / np.maximum(1.0 - pulled, 0.5), 0.0)  # as data alone have it
         square = np.sum(away**2, axis=1) / np.maximum(shown.sum(axis=1), 1)
-        spread = np.clip(np.sqrt(square), before, WIDEST_BODY)
+        spread = np.clip(np.sqrt(square), before, 100.0)  # times the prior's
         more = np.outer(1.0 / spread**2 - 1.0 / before**2, 1.0 / PRIOR_STD**2).ravel()
         self.prior[at, at] += more
         self.prior_rhs[at] += more * np.tile(neutral_body(), len(spread))
@@ -799,7 +792,7 @@ def likely_spread(x: Array, variance: Array, spread: float) -> float:
     """
     data = np.maximum(1.0 / variance - 1.0 / spread**2, 0.0)
     told, square = x / variance, spread**2
-    for _ in range(SPREAD_STEPS):
+    for _ in range(50):  # at each look at how large the effects are
         variance = 1.0 / (1.0 / square + data)
         square = float(np.mean((variance * told) ** 2 + variance))
     return math.sqrt(square)

@@ -25,7 +25,6 @@ from adapter.physics.kernels import (
 )
 from adapter.signals.records import StateLayout, columns
 
-LEAST_SPAN_S = 5e-3  # where states did not go through a filter
 LONGEST_STEP_NS = 20_000_000  # between two states that a torque is interpolated between
 ROOM = 512  # states that can wait
 
@@ -209,7 +208,7 @@ class TorqueRates:
         layout = StateLayout(tree.n, tree.floating)
         self._parent = np.array(tree.parent, dtype=np.int64)
         self._width = layout.before_links.stop
-        self._span_ns = round(1e9 * max(smoothing_s, LEAST_SPAN_S))
+        self._span_ns = round(1e9 * max(smoothing_s, 5e-3))  # where no filter was
         rows, tau = np.zeros((ROOM, self._width)), np.zeros((ROOM, tree.n))
         stamps, marks, bends = np.zeros(ROOM, np.int64), np.zeros(2, np.int64), np.zeros(tree.n + 1)
         self._ring = Waiting(rows, tau, stamps, marks, bends)

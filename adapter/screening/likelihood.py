@@ -26,13 +26,11 @@ FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # where the search for the noise begins: N m,
 INERTIA_SHARE, RADIUS_M = 0.4, 0.1  # plausible error of masses; of where they sit
 LOAD_STD = np.repeat((3.0, 0.3, 0.05), (1, 3, 6))  # kg, kg m, kg m2
 FRICTION = (1.0, 4.0, 4.0, 0.1)  # std of offset, Coulomb, viscous (N m, N m, N m s/rad), gain
-TILT_STD_RAD = np.deg2rad(5.0)  # of a base: what stands on a wall is read as such
 SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque went through
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
 HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
 REST = 0.3  # root of the weight of a row at rest: a second of them is about one independent one
-ROUNDS = 6  # of noise after fit; it settles in three
 EVIDENCE = 40.0  # twice the log-likelihood that a reading must gain: odds of 1 to 500 million
 ROWS = 100  # instants that are judged
 BEYOND_RAD, BEYOND = 0.2, 100.0  # over a limit; what a recording all beyond it costs
@@ -137,7 +135,7 @@ class Telling:
         """How well rows are explained on a base that stands askew, and gravity (3,) in its axes."""
         arm, still = self.arm, np.zeros_like(rows.q)
         size = float(np.linalg.norm(arm.gravity))
-        aside = size * TILT_STD_RAD * np.linalg.svd(arm.gravity[None])[2][1:]
+        aside = size * np.deg2rad(5.0) * np.linalg.svd(arm.gravity[None])[2][1:]  # of a base
         bodies = arm.theta
         for _ in range(2):  # what the hand holds is askew as well
             tilts = [arm.changed(bodies, x).torque(rows.q, still, still) for x in aside]
@@ -153,7 +151,9 @@ class Telling:
         columns, model = self._columns(rows, changed)
         if more is not None:
             columns = np.concatenate([columns, more], axis=2)
-        (m, n), beyond = model.shape, self._beyond(rows.q)
+        (m, n), limits = model.shape, self.model.limits
+        over = np.maximum(rows.q - limits.upper, limits.lower - rows.q) > BEYOND_RAD
+        beyond = BEYOND * float((over & (limits.upper > limits.lower)).mean(axis=0).sum())
         counts = np.where(np.abs(rows.dq) < SMOOTHING_DQ, REST, 1.0)  # as roots of weights
         counts /= np.sqrt(np.mean(np.square(counts), axis=0))
         columns *= counts[:, :, None]
@@ -164,7 +164,7 @@ class Telling:
         def of(tau: Array) -> Explained:
             apart, sigma = counts * (tau - model), plausible_nm(model)
             products = np.einsum("mjk,mj->jk", columns, apart)
-            for _ in range(ROUNDS):
+            for _ in range(6):  # of noise after fit; it settles in three
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
                 normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
                 x = np.linalg.solve(normal, weight @ products)
@@ -222,12 +222,6 @@ class Telling:
             later = (np.arange(len(model)) >= changed)[:, None, None]
             parts.append(later * regressor[:, :, -10:] * LOAD_STD)
         return np.concatenate(parts, axis=2), model
-
-    def _beyond(self, q: Array) -> float:
-        """What positions (m, n) outside the model's limits cost."""
-        low, high = self.model.limits.lower, self.model.limits.upper
-        over = (np.maximum(q - high, low - q) > BEYOND_RAD) & (high > low)
-        return BEYOND * float(over.mean(axis=0).sum())
 
 
 def by_joint(columns: Sequence[Array]) -> Array:

@@ -29,13 +29,7 @@ from adapter.screening.likelihood import (
     plausible_nm,
 )
 
-MOST = 3  # readings in one recording
-DATES = tuple(
-    np.linspace(0.1, 0.9, 9)
-)  # shares of it at which the hand may take or leave something
 NUMBER = 4.0  # what a number costs that a reading takes from the recording: it was one of some ten
-SEEN_NM = 0.3  # rms of a joint's model torque below which nothing is read from it
-CLEAR = 4.0  # standard deviations of a joint's share, from which on it tells anything
 UNITS = {
     1000.0: "N mm",
     100.0: "N cm",
@@ -43,18 +37,9 @@ UNITS = {
     0.01: "torque of the motors before gears of 1:100",
     0.001: "kN m",
 }
-LARGE_FACTOR = 5.0  # of all torques; models are not wrong by so much, units and drives' gains are
 NEAR_UNIT = 3.0  # a unit so far from the size that torques have is worth trying
 SIZE_ROUNDS, LEAST_FACTOR = 4, 1.5  # of one joint's size; gains and friction explain less
 G, ASKEW_RAD = 9.81, np.deg2rad(15.0)  # m/s²; a load bends what torques say of gravity so far
-TILT_RAD = np.deg2rad(20.0)  # of gravity; less is a base that stands askew
-ZEROS = np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0])
-NEAR = 2  # joints up to which an axis may be told against another (parallel links)
-CURRENTS = (
-    "convert them with --tau-gain G1,G2,... (N m per recorded unit, one per joint or one for "
-    "all), learn the gains with --tau-gain fit, or give --gear G1,G2,... where they are torques "
-    "of the motors; --tau-gain 1 takes them as N m"
-)
 
 
 class Reading(NamedTuple):
@@ -111,12 +96,12 @@ def torque_shares(rows: Rows, telling: Telling) -> TorqueShares:
     for j in np.flatnonzero(telling.alive):
         columns = np.column_stack([np.ones(m), step[:, j], rows.dq[:, j], model[:, j]])
         inverse = np.linalg.pinv(columns.T @ columns)
-        if inverse[3, 3] * m * SEEN_NM**2 < 1.0:
+        if inverse[3, 3] * m * 0.3**2 < 1.0:  # N m rms of its model torque
             x = inverse @ columns.T @ rows.tau[:, j]
             left = np.mean((rows.tau[:, j] - columns @ x) ** 2)
             share[j] = x[3]
             std[j] = np.sqrt(left * inverse[3, 3] * m / min(telling.samples, m))
-    return TorqueShares(share, std, CLEAR * std < np.abs(share))
+    return TorqueShares(share, std, 4.0 * std < np.abs(share))  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -142,7 +127,7 @@ class Readings:
             said = f"{names[i]} and {names[j]} are swapped: give each its own name in the recording"
             rows = self.rows.turned(np.eye(len(names))[order])
             yield Reading("joint", said, rows._replace(tau=rows.tau[:, order]))
-            if j - i <= NEAR:
+            if j - i <= 2:  # parallel links
                 yield from self._coupled(i, j)
         if not self.telling.unit_known:
             yield from self._units()
@@ -225,7 +210,7 @@ class Readings:
         apart = (rows.tau - self.model + own) * weight
         found = np.asarray(np.linalg.lstsq(columns, apart.ravel(), rcond=None)[0], dtype=float)
         size = float(np.linalg.norm(found))
-        if not size or angle(found, arm.gravity) < TILT_RAD:
+        if not size or angle(found, arm.gravity) < np.deg2rad(20.0):  # a base that stands askew
             return
         gravity = found * (G / size)
         told = ", ".join(f"{x:.1f}" for x in gravity)
@@ -245,7 +230,7 @@ class Readings:
         turn, name = 1.0 - 2.0 * unit, self.names[j]
         said = f"{name} counts the other way round: --turn {name}"
         yield Reading("joint", said, rows.turned(np.diag(turn))._replace(tau=rows.tau * turn))
-        for zero in ZEROS:
+        for zero in np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0]):
             way = "more" if zero > 0.0 else "less"
             said = (
                 f"the zero of {name} is elsewhere than the model's: its own angle is "
@@ -275,7 +260,7 @@ class Readings:
         """All torques in another unit: a known one, or each joint its own (motor currents)."""
         share, n = self.shares, len(self.names)
         common = float(np.median(np.abs(share.factor)))
-        if not share.tells.any() or abs(np.log(common)) < np.log(LARGE_FACTOR):
+        if not share.tells.any() or abs(np.log(common)) < np.log(5.0):  # no model is so wrong
             return
         near = {u: w for u, w in UNITS.items() if abs(np.log(u / common)) < np.log(NEAR_UNIT)}
         for (size, name), sign in [(x, s) for x in near.items() for s in (1.0, -1.0)]:
@@ -296,7 +281,9 @@ class Readings:
         rest = f" ({', '.join(silent)}: not shown)" if silent else ""
         said = (
             f"effort of {which} looks like motor current: {times} times too {word} for any arm of "
-            f"this model{rest}; {CURRENTS}"
+            f"this model{rest}; convert them with --tau-gain G1,G2,... (N m per recorded unit, one "
+            "per joint or one for all), learn the gains with --tau-gain fit, or give --gear "
+            "G1,G2,... where they are torques of the motors; --tau-gain 1 takes them as N m"
         )
         yield Reading("scale", said, _divided(self.rows, share.factor), len(telling))
 
@@ -327,7 +314,7 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
     """
     now = telling.explained(rows)
     found: list[Reading] = []
-    while len(found) < MOST:
+    while len(found) < 3:  # readings in one recording
         far = {loaded: telling.apart(rows, loaded) for loaded in (True, False)}
         every = Readings(rows, telling)
         nearer = [x for x in every if telling.apart(x.rows, x.with_load) < far[x.with_load]]
@@ -346,7 +333,7 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
 
 def other_hand(rows: Rows, telling: Telling) -> Explained:
     """How well the model explains rows where the hand takes or leaves something half way."""
-    dates = (np.array(DATES) * len(rows.q)).astype(int).tolist()
+    dates = (np.linspace(0.1, 0.9, 9) * len(rows.q)).astype(int).tolist()
     return min((telling.explained(rows, date) for date in dates), key=lambda x: x.cost)
 
 

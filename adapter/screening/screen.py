@@ -38,18 +38,12 @@ from drivers.files.mcap import Log
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
-MOTION_S = 0.2  # of motion faster than half MOVES_DQ; less tells nothing of a joint
 SHORTEST_S, FEWEST = 1.5, 100  # seconds and samples of a recording
 WANTED_RAD, WANTED_DQ = 0.3, 0.3  # what to ask for
 DEGREES = 180.0 / np.pi
 TURNS_RAD = 4.0 * np.pi  # no arm joint turns further than two turns either way
 BEYOND_RAD, BEYOND_SHARE = 0.2, 0.05  # over the limit, and in which share of the samples
 EVERY = 40  # ms at least between the rows that are judged
-FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
-PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
-LEAST_TILT_RAD = np.deg2rad(1.0)  # of a base: so well a table is level
-NAMED_LATE_S = 0.02  # of torques: what is less a bus and a filter make, which `gap` names
-DDQ_S = 0.02  # either side of an instant, over which velocities tell accelerations
 EDGE = 300  # ms at either end, where the filter has no neighbours
 
 
@@ -147,7 +141,7 @@ class Judged:
             if not missing.any():
                 return piece
             t = 1e-9 * (piece.stamp_ns - piece.stamp_ns[0])
-            around = max(round(DDQ_S / max(float(np.median(np.diff(t))), 1e-9)), 1)
+            around = max(round(0.02 / max(float(np.median(np.diff(t))), 1e-9)), 1)  # s either side
             back, ahead = (np.clip(np.arange(len(t)) + k, 0, len(t) - 1) for k in (-around, around))
             span = np.maximum(t[ahead] - t[back], GRID_S)[:, None]
             ddq = (piece.dq[ahead] - piece.dq[back]) / span
@@ -203,7 +197,7 @@ def refuse(log: Log, model: SelfModel) -> Screened:
     dead = silent(log, names)
     torque = judged(log, model, (q, dq, ddq, tau), recorded if renamed else ())
     said = standing(names, moving, q, dq)
-    late_s = torque.late_s if abs(torque.late_s) >= NAMED_LATE_S else 0.0
+    late_s = torque.late_s if abs(torque.late_s) >= 0.02 else 0.0  # less is for `gap`
     torque = replace(torque, late_s=late_s, gravity=None)  # `gap` names a tilt, with its doubt
     return Screened(log, timing, moving, outside, said, dead + torque.notes, torque)
 
@@ -344,7 +338,7 @@ def moving_joints(q: Array, dq: Array, period_s: float = GRID_S) -> tuple[int, .
     """Joints (from 0) that move enough; q, dq (m, n) rad, rad/s, smoothed, period_s apart."""
     wide, fast = _extent(q, dq)
     long = (np.abs(dq) > 0.5 * MOVES_DQ).sum(axis=0) * period_s
-    moves = (wide >= MOVES_RAD) & (fast >= MOVES_DQ) & (long >= MOTION_S)
+    moves = (wide >= MOVES_RAD) & (fast >= MOVES_DQ) & (long >= 0.2)  # s
     return tuple(np.flatnonzero(moves).tolist())
 
 
@@ -472,7 +466,7 @@ def _judged(
     passed = Judged(late_s, partial(telling.corrected, now.x))
     if model.gravity.any():
         askew, gravity = telling.askew(rows)
-        if askew.cost < now.cost - EVIDENCE and angle(gravity, model.gravity) > LEAST_TILT_RAD:
+        if askew.cost < now.cost - EVIDENCE and angle(gravity, model.gravity) > np.deg2rad(1.0):
             return replace(passed, gravity=gravity)
     return passed
 
@@ -498,9 +492,8 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     """
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
     behind = pauses(stamps_s)
-    stamps_s[1:] -= np.cumsum(
-        np.maximum(np.diff(stamps_s) - PAUSE_S, 0.0)
-    )  # a clock that steps on by hours
+    # a second is left of a longer pause: a clock may step on by hours
+    stamps_s[1:] -= np.cumsum(np.maximum(np.diff(stamps_s) - 1.0, 0.0))
     signals = smooth(stamps_s, log.q, log.dq, log.tau)
     t, clear = GRID_S * np.arange(len(signals[0])), np.ones(len(signals[0]), dtype=bool)
     for k in behind:
@@ -527,7 +520,7 @@ def torque_verdict(log: Log, model: SelfModel) -> tuple[Judged | None, list[str]
         return None, []
     part = part.take(rows)
     smoothed = smoothed_rows(part)
-    if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
+    if len(smoothed[0]) < 1000 or not moving_joints(smoothed[0], smoothed[1]):  # ms
         return None, []
     said = silent(part, model.tree.joint_names)
     torque = judged(part, model, smoothed)

@@ -14,22 +14,12 @@ from scipy.signal import butter, sosfiltfilt
 from adapter.model.spatial import Array
 
 HOLE_PERIODS = 3.0  # a step longer than so many median periods is a hole
-FROZEN_PERIODS = 10  # so many identical samples in a row are a stuck source, not a repeat
-AROUND = 5  # samples, of which the middle one tells where a reading should be
 # A reading further from it than so many usual ones, and than this share of its range, is no arm's.
 SPIKE_TIMES, SPIKE_SHARE = 15.0, 0.2
 PUT_BACK_S = 1.0  # of a pause where a clock was put back, which says nothing of how long it took
-WRAP_RAD = 0.5  # between two samples; a step so near a whole turn is none
-HELD_NM = 0.3  # that the arm holds throughout, so that torques of zero are none
-FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
-HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower source
 CUT_HZ = 8.0  # band in which velocity and position are compared: arms move below it
-MOVES_DQ = 0.02  # rad/s; slower is noise
 FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
-STEPS_OF_LATENESS = 3  # each repeats the linearised fit about the last one
-SIGNIFICANT = 3.0  # standard deviations
 TIMING_SHARE = 0.25  # of a sample period: a hold of half a sample, two of these, is no effect
-LEAST_STD_S = 1e-6  # of a lateness; no clock is better
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
 
 Index = NDArray[np.int64]
@@ -79,7 +69,7 @@ class RecordingClock:
     def hold_lag_s(self, signal: str) -> float:
         """Mean age of a signal that arrives more often than it is updated; 0 where it is new."""
         share = self.held[signal]
-        if share < HELD_SHARE or share > 0.999:
+        if share < 0.3 or share > 0.999:  # more is a slower source
             return 0.0
         return 0.5 * self.period_s * share / (1.0 - share)
 
@@ -156,7 +146,7 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
         np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s")
     )
     told = np.isfinite(late) & np.isfinite(std)
-    weight = np.maximum(std[told], LEAST_STD_S) ** -2.0
+    weight = np.maximum(std[told], 1e-6) ** -2.0  # of a lateness; no clock is better
     gains = np.array([c.velocity_gain for c in clocks])
     seen = np.isfinite(gains).any(axis=0)
 
@@ -191,7 +181,7 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
 def lateness(clock: RecordingClock) -> float:
     """How much later dq is than q, where that is known, s."""
     late, std = clock.lateness_s, clock.lateness_std_s
-    return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
+    return late if np.isfinite(late) and abs(late) > 3.0 * std else 0.0  # standard deviations
 
 
 def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingClock:
@@ -222,7 +212,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         rate_hz=1.0 / period_s if period_s else 0.0,
         jitter_s=float(np.std(regular)) if len(regular) else 0.0,
         holes=tuple((float(since_s[increasing[k]]), float(steps_s[k])) for k in gaps),
-        frozen=_runs(again & (np.abs(dq[1:]).max(axis=1) > FROZEN_DQ), since_s),
+        frozen=_runs(again & (np.abs(dq[1:]).max(axis=1) > 0.05), since_s),  # rad/s: it moves
         repeated=float(again.sum()) / max(m, 1),
         held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
         out_of_order=m - len(increasing),
@@ -258,7 +248,7 @@ def unwrapped(q: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.i
         lower, upper: (n,) rad, limits; of all turns that one is taken which lies nearest to them.
     """
     step = np.nan_to_num(np.diff(q, axis=0))
-    turns = np.where(np.abs(np.abs(step) - 2.0 * np.pi) < WRAP_RAD, np.sign(step), 0.0)
+    turns = np.where(np.abs(np.abs(step) - 2.0 * np.pi) < 0.5, np.sign(step), 0.0)  # so near a turn
     joints = np.flatnonzero(turns.any(axis=0))
     if not joints.size:
         return q, joints
@@ -300,7 +290,7 @@ def possible(q: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
         return np.ones(len(tau), dtype=bool)
     good = ~unsaid(tau)
     for x in (q, dq, tau) if good.any() else ():
-        apart = np.abs(x - median_filter(x, size=(AROUND, 1), mode="nearest"))
+        apart = np.abs(x - median_filter(x, size=(5, 1), mode="nearest"))  # samples
         low, high = np.percentile(x[good], (1, 99), axis=0)
         usual = np.median(apart[good], axis=0)
         good &= (apart <= np.maximum(SPIKE_TIMES * usual, SPIKE_SHARE * (high - low))).all(axis=1)
@@ -316,7 +306,7 @@ def unsaid(tau: Array) -> NDArray[np.bool_]:
     if not dead.any() or dead.all():
         return np.zeros(len(tau), dtype=bool)
     holds = np.percentile(np.abs(tau[~dead]).max(axis=1), 10)
-    return np.asarray(dead & (holds > HELD_NM))
+    return np.asarray(dead & (holds > 0.3))  # so zeros are none
 
 
 def _same(x: Array) -> NDArray[np.bool_]:
@@ -348,7 +338,7 @@ def _increasing(stamp_ns: Index) -> Index:
 def _runs(again: NDArray[np.bool_], since_s: Array) -> tuple[tuple[float, float], ...]:
     """(start, length) s of long runs of repeats."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], again, [False]]).astype(int)))
-    runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= FROZEN_PERIODS]
+    runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= 10]  # a stuck source
     return tuple((float(since_s[a]), float(since_s[b] - since_s[a])) for a, b in runs)
 
 
@@ -376,7 +366,7 @@ def _lateness(t: Array, q: Array, dq: Array, period_s: float) -> tuple[float, fl
     smooth = sosfiltfilt(sos, table, axis=0)
     rate = np.gradient(smooth[:, :n], step_s, axis=0)
     late_s, found = 0.0, nothing
-    for _ in range(STEPS_OF_LATENESS):
+    for _ in range(3):  # each repeats the linearised fit about the last one
         moved = np.column_stack([np.interp(grid - late_s, grid, x) for x in rate.T])
         change, std_s, gain = _fit(moved, smooth[:, n:], step_s, pick)
         if not np.isfinite(change):
@@ -406,7 +396,7 @@ def _fit(rate: Array, dq: Array, step_s: float, pick: Index) -> tuple[float, flo
     blocks = np.array_split(np.arange(len(pick)), BLOCKS)
     xx = np.array([np.einsum("tji,tjk->jik", x[b], x[b]) for b in blocks])
     xy = np.array([np.einsum("tji,tj->ji", x[b], y[b]) for b in blocks])
-    moves = np.std(rate[pick], axis=0) > MOVES_DQ
+    moves = np.std(rate[pick], axis=0) > 0.02  # rad/s; slower is noise
     gain = np.where(moves, 0.0, np.nan)
     moves &= np.std(y, axis=0) > 0.0
     if not moves.any():

@@ -13,7 +13,6 @@ from scipy import sparse
 from adapter.model.spatial import Array
 
 LENGTH = 0.1  # m, in units of which the entries of a link's pseudo-inertia (kg) are of like size
-PRECISION = 1e-10  # of the solver, relative and absolute
 SOLVED = ("Solved", "AlmostSolved")
 
 _UPPER = [(row, column) for column in range(4) for row in range(column + 1)]
@@ -50,7 +49,7 @@ def solve_conic(
     """Minimise x·Q x / 2 + linear·x where right - left x lies in cones: x, steps, solved."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = PRECISION
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10  # relative and absolute
     # Its scaling of rows would turn the cones; the units above scale better.
     settings.equilibrate_enable = False
     upper = sparse.triu(sparse.csc_matrix(quadratic), format="csc")

@@ -24,14 +24,6 @@ from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array, zxz_from_matrix
 from adapter.physics.freedom import Freedom
 
-# No weight looks below this share of a signal's power (1e-7 of its size): rounding of moments.
-RESIDUAL_FLOOR = 1e-14
-# Noise alone makes curvature of the size of the square root of the count (schema learner).
-NOISE_CURVATURE = 10.0
-ROUNDS = 2  # of weighting by what the fit leaves
-LARGEST_STD = 0.05  # rad, m; a direction with more counts as not shown
-ALONE = 1.0 - 1e-6  # share of a turn or shift inside the shown directions that counts as all
-
 
 @dataclass(frozen=True)
 class SchemaResult:
@@ -74,7 +66,7 @@ def schema_from_moments(data: TreeData, noise: Array | None = None) -> SchemaRes
     return SchemaResult(
         lam=np.stack([np.r_[zxz_from_matrix(x.frame.R0), x.frame.p] for x in joints]),
         std=np.stack([joint.std for joint in joints]),
-        observable=np.diagonal(shown, axis1=1, axis2=2) > ALONE,
+        observable=np.diagonal(shown, axis1=1, axis2=2) > 1.0 - 1e-6,  # but for rounding
         freedom=Freedom.of(np.eye(6) - shown, np.stack([x.frame.p for x in joints])),
         ranks=tuple(round(float(np.trace(p))) for p in shown),
     )
@@ -92,7 +84,7 @@ class _Joint:
         self.power = moments.power()[j]
         weights = self._weights(self.power / (3.0 * self.count))
         self.frame, _ = best_frame(self.sums, weights, zero)
-        for _ in range(ROUNDS):
+        for _ in range(2):  # of weighting by what the fit leaves
             weights = self._weights(self._left_over() if given is None else 2.0 * given)
             self.frame, _ = descend(self.sums, weights, self.frame)
         clean = self.sums
@@ -108,14 +100,17 @@ class _Joint:
 
     def _weights(self, variance: Array) -> Array:
         """1 / variance by channel; a channel without signal or measurement weighs nothing."""
-        floor = RESIDUAL_FLOOR * self.power / (3.0 * self.count)
+        # No weight looks below this share of a signal's power (1e-7 of its size): rounding of
+        # moments.
+        floor = 1e-14 * self.power / (3.0 * self.count)
         some = self.used & (self.power > 0.0)
         return np.where(some, 1.0 / np.where(some, np.maximum(variance, floor), 1.0), 0.0)
 
     def _judge(self, clean: Array, weights: Array) -> None:
         """Directions that count as shown, and the spread inside them, in the parent's axes."""
         values, vectors = curvature_in_parent(clean, weights, self.frame)
-        least = max(LARGEST_STD**-2, NOISE_CURVATURE * np.sqrt(self.count))
+        # Noise alone makes curvature of the size of the square root of the count (schema learner).
+        least = max(0.05**-2, 10.0 * np.sqrt(self.count))  # 0.05 rad or m: more is not shown
         shown = values > max(least, RELATIVE_CURVATURE * float(values[-1]))
         kept = vectors[:, shown]
         self.shown = kept @ kept.T

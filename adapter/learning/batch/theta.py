@@ -23,11 +23,6 @@ from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
 
 ROUNDS = 5  # of weighting by what is left, at most
-# Residuals are not trusted below this share of a row's size when they set its weight; without a
-# floor, rounds of weighting end with the rows that happen to fit best deciding alone.
-RESIDUAL_FLOOR = 1e-4
-# Weights that move by less than this share in a round have settled.
-SETTLED_WEIGHTS = 0.1
 
 _SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _LIMBS = {
@@ -161,9 +156,13 @@ def learn_theta(
     whole = "whole tree", tuple(range(tree.bodies))
     solve(*whole)
     for _ in range(rounds):
-        floor, before = RESIDUAL_FLOOR * scales(rows), std
+        # Residuals are not trusted below this share of a row's size when they set its weight;
+        # without a floor, rounds of weighting end with the rows that happen to fit best deciding
+        # alone.
+        floor, before = 1e-4 * scales(rows), std
         std = np.maximum([row.residual(theta) for row in rows], floor)
-        if np.abs(std / before - 1.0).max() < SETTLED_WEIGHTS:
+        # Weights that move by less than this share in a round have settled.
+        if np.abs(std / before - 1.0).max() < 0.1:
             break
         solve(*whole)
     least = float(min_eigenvalue(theta).min())

@@ -19,7 +19,6 @@ from adapter.model.tree import Tree
 from adapter.physics.kernels import frames_of, regressors
 
 CHUNK = 1024  # samples a QR update takes in
-SMALLEST_SCALE = 1e-6  # of the median row: a row that is zero throughout gets the median's scale
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def scales(rows: list[RowFactor]) -> Array:
     """A first standard deviation of every row: its size; for rows that are zero the median's."""
     sizes = np.array([np.linalg.norm(row.r[:, -1]) / np.sqrt(row.count) for row in rows])
     usual = float(np.median(sizes[sizes > 0.0])) if (sizes > 0.0).any() else 1.0
-    return np.where(sizes > SMALLEST_SCALE * usual, sizes, usual)
+    return np.where(sizes > 1e-6 * usual, sizes, usual)  # a row of zeros
 
 
 def system(rows: list[RowFactor], std: Array, bodies: tuple[int, ...]) -> tuple[Array, Array]:

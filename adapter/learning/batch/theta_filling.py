@@ -31,16 +31,7 @@ from adapter.model.inertia import (
 from adapter.model.spatial import Array
 
 KEPT = 0.05  # of a documented body that is left of it at least, where what was learned allows it
-LEAST_KEPT = 1e-3  # the same where no possible body has what was learned
 LEAST_SIZE = 1e-3  # share of a measuring body, and kg, that a documented one has at least
-# m: as if documented bodies were spread so far about their centres at least, others are measured. A
-# rod or a point is not spread; beside a flat one (the Panda's second link) some millimetres weighed
-# more than 20 kg.
-THICK = 0.03
-# Information on a share of a documented body from which data tell it: with less they know it no
-# better than as somewhere between nothing and twice as much. After 2 to 15 s of real logs torque
-# errors on the rest were 0.67 to 1.05 times those of all that any motion can show (at 10: to 1.7).
-LEAST_TOLD = 1.0
 NEARNESS = 1e-8  # weight of nearness beside the torques, where both cannot be had
 ALONE = 0.99  # of a parameter that must show for it to be called learned
 UNSOLVED = "no possible bodies were found near what was learned; is it sound?"
@@ -118,7 +109,11 @@ def told_basis(information: Array, told: Array) -> Array:
     """
     units = Measure(told).units
     worth, ways = np.linalg.eigh(units @ information @ units.T)
-    return np.linalg.qr(np.linalg.solve(units, ways[:, worth > LEAST_TOLD]))[0]
+    # Information on a share of a documented body from which data tell it: with less they know it no
+    # better than as somewhere between nothing and twice as much. After 2 to 15 s of real logs
+    # torque errors on the rest were 0.67 to 1.05 times those of all that any motion can show (at
+    # 10: to 1.7).
+    return np.linalg.qr(np.linalg.solve(units, ways[:, worth > 1.0]))[0]
 
 
 def filled_words(basis: Array, names: tuple[str, ...]) -> list[str]:
@@ -152,7 +147,10 @@ class Measure:
         spread = whole[:, :3, :3] - mass[..., None] * centre[:, :, None] * centre[:, None, :]
         values, vectors = np.linalg.eigh(spread)
         self._root = np.zeros_like(whole)
-        self._root[:, :3, :3] = vectors * np.sqrt(np.maximum(values, mass * THICK**2))[:, None, :]
+        # m: as if documented bodies were spread so far about their centres at least, others are
+        # measured. A rod or a point is not spread; beside a flat one (the Panda's second link) some
+        # millimetres weighed more than 20 kg.
+        self._root[:, :3, :3] = vectors * np.sqrt(np.maximum(values, mass * 0.03**2))[:, None, :]
         self._root[:, :3, 3], self._root[:, 3, 3:] = np.sqrt(mass) * centre, np.sqrt(mass)
         self._inverse = np.linalg.inv(self._root)
         self.told, self.cones = self.of(told), cones(len(told))
@@ -211,7 +209,7 @@ def _nearest_by_torque(measure: Measure, start: Array, regressor: Array) -> Fill
         quadratic,
         -table.T @ (table @ start) - NEARNESS * measure.told,
         -np.eye(len(start)),
-        -LEAST_KEPT * measure.own,
+        -1e-3 * measure.own,  # the same where no possible body has what was learned
         measure.cones,
     )
     least = measure.least(share) if np.isfinite(share).all() else 0.0

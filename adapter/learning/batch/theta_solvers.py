@@ -21,8 +21,6 @@ from adapter.model.spatial import Array
 from adapter.physics.identifiability import RANK_TOLERANCE
 
 EDGE = 1e-6  # kg, least eigenvalue in those units of a body that noise pushes to the edge
-ROOM = 1e-2  # kg, such an eigenvalue from which on more room is worth nothing
-LIGHT = 1e-6  # kg of room that 1 kg of mass (and of its size) is worth: what is unseen stays light
 HELD = 1e-9  # weight of a body of 1 kg and radius `LENGTH`, to the mean weight of the data
 
 
@@ -113,7 +111,7 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
     free = np.linalg.qr(moved.reshape(10 * bodies, count))[0]
     one = np.tile(_ONE, bodies)
     size = max(float(np.abs(fixed).max()), 1e-300)
-    goal = np.append(LIGHT * (free.T @ one), -1.0)
+    goal = np.append(1e-6 * (free.T @ one), -1.0)  # what is unseen stays light
     in_cone = np.column_stack([-free, one])
     in_room = np.append(np.zeros(count), 1.0)
     in_cones = [*cones(bodies), nonnegative(1)]
@@ -121,7 +119,7 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
         np.zeros((count + 1, count + 1)),
         goal,
         np.vstack([in_cone, in_room]),
-        np.append(fixed, ROOM) / size,
+        np.append(fixed, 1e-2) / size,  # kg: more room is worth nothing
         in_cones,
     )
     if not np.isfinite(x).all():
