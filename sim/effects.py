@@ -186,24 +186,6 @@ def payload(
     return Effect("payload", (), numbers, None if t_s is None else (t_s, None))
 
 
-def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
-    """The effect of a canonical entry: effect, joints, interval_s, parameters.
-
-    No other key counts.
-
-    Raises:
-        ValueError: unknown name, a key that is missing, unknown or not a number.
-    """
-    if isinstance(entry, Effect):
-        return entry
-    if "effect" not in entry or "parameters" not in entry:
-        raise ValueError(f"an effect entry has {sorted(entry)}; needs: effect, parameters")
-    span = entry.get("interval_s")
-    interval = None if span is None else (float(span[0] or 0.0), span[1])
-    joints = tuple(entry.get("joints") or ())
-    return Effect(entry["effect"], joints, entry["parameters"], interval)
-
-
 def _check_keys(effect: Effect) -> None:
     """Raises ValueError for missing, unknown, non-finite or impossible parameters."""
     _, needed, optional = SPECS[effect.name]

@@ -39,10 +39,6 @@ def _there_and_back(far: float, speeds: Sequence[float], hold_s: float = 0.0) ->
     return [Move(sign * far, v, hold_s) for v in speeds for sign in (1.0, -1.0)]
 
 
-def _wide(up: float, down: float) -> list[Move]:
-    return [Move(up, WIDE), Move(-up - down, WIDE), Move(down, WIDE)]
-
-
 def _speeds(up: float, down: float) -> list[Move]:
     return _there_and_back(_side(up, down, FAR), RATES)
 
@@ -64,7 +60,7 @@ MOVES: dict[DecidingExperiment, Callable[[float, float], list[Move]]] = {
     SPEEDS: _speeds,
     BOTH_WAYS: _speeds,
     STILL: _still,
-    TURN: _wide,
+    TURN: lambda up, down: [Move(up, WIDE), Move(-up - down, WIDE), Move(down, WIDE)],
     TURNS: _turns,
 }
 

@@ -22,7 +22,7 @@ from adapter.gap.servo_fit import (
     first_guess,
     fit_joint,
 )
-from adapter.gap.servo_ground import LEAST_JOINTS, above, find_ground
+from adapter.gap.servo_ground import LEAST_JOINTS, find_ground
 from adapter.gap.servo_kernels import (
     DAMPING,
     INERTIA,
@@ -34,7 +34,7 @@ from adapter.gap.servo_kernels import (
     Load,
 )
 from adapter.gap.servo_model import ServoModel
-from adapter.gap.servo_signals import Track, loads
+from adapter.gap.servo_signals import Track, loads, over_ground
 from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -57,21 +57,13 @@ SHORTEST_S = 5.0
 ROUGH_STEP_S = 8e-3  # of the first simulations
 TOUCHED_S, LEAST_TOUCHED = 1.0, 2  # for so long, in so many recordings: its place is known
 
-UNITS = {
-    "servo_position_gain": ("kp", "N m/rad"),
-    "servo_velocity_gain": ("kd", "N m s/rad"),
-    "servo_delay": ("d", "s"),
-    "coulomb_friction": ("Fc", "N m"),
-    "viscous_friction": ("Fv", "N m s/rad"),
-    "motor_inertia": ("B", "kg m2"),
-}
-TITLES = {
-    "servo_position_gain": "position gain",
-    "servo_velocity_gain": "velocity gain",
-    "servo_delay": "delay of commands",
-    "coulomb_friction": "Coulomb friction",
-    "viscous_friction": "viscous friction",
-    "motor_inertia": "motor inertia (armature)",
+EFFECTS = {  # what each is called, its parameter and its unit
+    "servo_position_gain": ("position gain", "kp", "N m/rad"),
+    "servo_velocity_gain": ("velocity gain", "kd", "N m s/rad"),
+    "servo_delay": ("delay of commands", "d", "s"),
+    "coulomb_friction": ("Coulomb friction", "Fc", "N m"),
+    "viscous_friction": ("viscous friction", "Fv", "N m s/rad"),
+    "motor_inertia": ("motor inertia (armature)", "B", "kg m2"),
 }
 DAMPS = ("servo_velocity_gain", "viscous_friction")
 WITH_FRICTION = "velocity gain and viscous friction together: no command's speed tells them apart"
@@ -82,7 +74,7 @@ class ServoFinding:
     """One effect on some joints, whose number is not the documented one.
 
     Attributes:
-        effect: one of `UNITS`; joints: from 1.
+        effect: one of `EFFECTS`; joints: from 1.
         values, std, documented: one for each joint, SI; documented is None where nobody says.
         open: what cannot be told apart from it; empty where it stands alone.
     """
@@ -198,7 +190,8 @@ def explain(
         arm, fits = _rough(arm, [log.select(names) for log in logs], noise)
         fits = _named(arm, fits, progress)
         servos = _servos(arm, fits)
-    touched = tuple(_touched(arm, track) for track in tracks)
+    down = [over_ground(arm.rigid, arm.ground, track.smooth[0])[1] < 0.0 for track in tracks]
+    touched = tuple(float(x.sum() * t.step_s) for x, t in zip(down, tracks, strict=True))
     known = arm.ground is documented.ground or sum(x > TOUCHED_S for x in touched) >= LEAST_TOUCHED
     if not known:  # where it lies in other poses, one motion does not tell
         servos = replace(servos, ground=NO_GROUND)
@@ -263,14 +256,6 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
         arm = replace(arm, ground=ground)
     tasks = arm.tasks([track.smooth for track in arm.tracks])
     return arm, [fit_joint(task, ALL_FREE, own) for task, own in zip(tasks, x, strict=True)]
-
-
-def _touched(arm: _Arm, track: Track) -> float:
-    """Seconds for which the hand was on the ground."""
-    if arm.ground.root == 0.0:
-        return 0.0
-    on = above(arm.rigid, arm.ground, track.smooth[0]) < 0.0
-    return float(track.step_s * np.sum(on))
 
 
 def _motions(arm: _Arm, fits: Sequence[JointFit]) -> list[Array]:
@@ -459,7 +444,9 @@ class _Table:
 
     def __init__(self, arm: _Arm) -> None:
         self.docs = arm.documented
-        self.rows: dict[str, list[tuple[int, float, float, float | None]]] = {e: [] for e in UNITS}
+        self.rows: dict[str, list[tuple[int, float, float, float | None]]] = {
+            e: [] for e in EFFECTS
+        }
         self.together = False
         self.scale_open: list[int] = []
         self.notes: list[str] = []
@@ -473,9 +460,10 @@ class _Table:
             row = j + 1, float(value), float(std), float(documented) if told else None
             self.rows[effect].append(row)
         else:
+            title, _, unit = EFFECTS[effect]
             self.notes.append(
-                f"joint {j + 1}: {TITLES[effect]} of {value:.3g} {UNITS[effect][1]} is in the "
-                "model and not named: inertias as wrong as they may be explain as much"
+                f"joint {j + 1}: {title} of {value:.3g} {unit} is in the model and not named: "
+                "inertias as wrong as they may be explain as much"
             )
 
     def add_joint(self, j: int, fit: JointFit) -> None:

@@ -30,14 +30,14 @@ from adapter.gap.servo_fit import (
     fit_joint,
     misfit,
 )
-from adapter.gap.servo_kernels import NO_GROUND, A, Ground, all_above_ground
+from adapter.gap.servo_kernels import NO_GROUND, A, Ground
+from adapter.gap.servo_signals import over_ground
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 
 SIZE = np.array([0.02, 0.02, 0.02, 0.01, 0.5])  # steps of point (m), height (m), ln of the root
 FAR_M, REACH_M = 0.05, 0.05  # what touches is so far beyond the link's centre, and around there
 BEYOND_M, LOWEST = (0.0, 0.05, 0.1), 0.02  # starts: the point; share of time that it touches
-SETTLED = 1e-3  # share by which a step must lower the cost
 STIFF, YIELDS = 1e3, 5.0  # N/m, table and arm together; a factor of its root, one std deviation
 ROUGH, FINE = 6, 30  # steps of a fit from each start, and of the best
 PAYS_CHI2 = 25.0  # that the ground explains beside the servos, on unseen blocks, by joint
@@ -60,7 +60,7 @@ class _Together:
     def middles(self) -> list[Array]:
         """(m, n) rad in the middle of each step, as measured, by recording."""
         motions = (track.smooth[0] for track in self.tasks[0].tracks)
-        return [np.ascontiguousarray(0.5 * (q[1:] + q[:-1])) for q in motions]
+        return [0.5 * (q[1:] + q[:-1]) for q in motions]
 
     def beyond(self, way_m: float) -> Array:
         """(3,) m so far beyond the centre of mass of the link that touches, in its frame."""
@@ -78,16 +78,15 @@ class _Together:
         """(5,) from a point so far beyond the centre of mass, which touches at its lowest."""
         point = self.beyond(beyond_m)
         level = self.ground(np.array([*point / SIZE[:3], 0.0, 0.0]))
-        heights = np.concatenate([above(self.arm, level, q) for q in self.middles])
+        heights = np.concatenate([over_ground(self.arm, level, q)[1] for q in self.middles])
         return np.array([*point, np.quantile(heights, LOWEST), 0.5 * np.log(STIFF)]) / SIZE
 
     def under(self, ground: Ground) -> list[JointTask]:
         """The tasks with it."""
         tables = []
         for q in self.middles:
-            lift, over = np.zeros_like(q), np.zeros(len(q))
-            all_above_ground(self.arm.frames, ground, q, lift, over)
-            tables.append((lift, over[:, None] - lift * q))
+            lift, above = over_ground(self.arm, ground, q)
+            tables.append((lift, above[:, None] - lift * q))
         found = []
         for task in self.tasks:
             at, pairs = task.joint, zip(task.loads, tables, strict=True)
@@ -190,16 +189,9 @@ def robust_fit(
                 z, rows, cost, damping = trial, moved, after, damping / 5.0
                 break
             damping *= 5.0
-        if before - cost < SETTLED * before:
+        if before - cost < 1e-3 * before:  # settled
             break
     return z, cost
-
-
-def above(arm: RigidArm, ground: Ground, q: Array) -> Array:
-    """(m,) m of the hand over the ground, for q (m, n) rad."""
-    lift, over = np.zeros_like(q), np.zeros(len(q))
-    all_above_ground(arm.frames, ground, np.ascontiguousarray(q), lift, over)
-    return over / ground.root
 
 
 def find_ground(arm: RigidArm, tasks: Sequence[JointTask], x: Array) -> tuple[Ground, Array]:
@@ -211,9 +203,12 @@ def find_ground(arm: RigidArm, tasks: Sequence[JointTask], x: Array) -> tuple[Gr
     best, least = None, np.inf
     # a recording in which the hand is held spoils the servos; each alone is another start
     starts = [x]
-    if len(tasks[0].tracks) > 1:
-        for each in _alone(tasks):
-            starts.append(np.array([fit_joint(t, ALL_FREE, first_guess(t)).x for t in each]))
+    count = len(tasks[0].tracks)
+    for i in range(count if count > 1 else 0):
+        each = [
+            replace(t, tracks=[t.tracks[i]], loads=[t.loads[i]], rows=[t.rows[i]]) for t in tasks
+        ]
+        starts.append(np.array([fit_joint(t, ALL_FREE, first_guess(t)).x for t in each]))
     for link, beyond in product(range(max(arm.n - 2, 0), arm.n), BEYOND_M):
         one = _Together(arm, tasks, link)
         y, servos, cost = one.start(beyond), x, np.inf
@@ -235,12 +230,3 @@ def find_ground(arm: RigidArm, tasks: Sequence[JointTask], x: Array) -> tuple[Gr
     if np.sum(gain / unit > PAYS_CHI2) < LEAST_JOINTS or gain.sum() < 0.0:
         return NO_GROUND, x
     return one.ground(y), servos
-
-
-def _alone(tasks: Sequence[JointTask]) -> list[list[JointTask]]:
-    """The tasks on each recording alone."""
-    parts = range(len(tasks[0].tracks))
-    return [
-        [replace(t, tracks=[t.tracks[i]], loads=[t.loads[i]], rows=[t.rows[i]]) for t in tasks]
-        for i in parts
-    ]

@@ -160,17 +160,17 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
 
 def _ground(path: Path, facts: Any, joint_names: tuple[str, ...]) -> Ground:
     try:
-        link, root = joint_names.index(facts["joint"]), np.sqrt(facts["stiffness"])
+        link = joint_names.index(facts["joint"])
+        height, stiffness = float(facts["height"]), float(facts["stiffness"])
         point, up = (np.array(facts[key], dtype=float).reshape(3) for key in ("point", "up"))
-        ground = Ground(link, point, up, float(facts["height"]), float(root))
+        if not np.all(np.isfinite([*point, *up, height])) or not 0.0 < stiffness < np.inf:
+            raise ValueError("a number is none of a ground")
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(
             f"{path}: [ground] needs the joint (one of {', '.join(joint_names)}), point and up of "
             f"three numbers, height and stiffness: {error}"
         ) from error
-    if not (np.all(np.isfinite([*point, *up, ground.height, root])) and root > 0.0):
-        raise ModelError(f"{path}: [ground] has numbers that no ground has")
-    return ground
+    return Ground(link, point, up, height, float(np.sqrt(stiffness)))
 
 
 def _number(path: Path, row: Mapping[str, Any], key: str, needed: bool) -> float:

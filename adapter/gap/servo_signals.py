@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,6 +41,7 @@ class Track:
     held: Array
     gained: Array
     smooth: Array
+    _alone: dict[int, Track] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, log: Log, longest_step_s: float = LONGEST_STEP_S) -> Track:
@@ -71,18 +72,9 @@ class Track:
         """The same of one joint (from 0)."""
         if joint not in self._alone:
             at = slice(joint, joint + 1)
-            self._alone[joint] = replace(
-                self,
-                q=self.q[:, at],
-                held=self.held[:, at],
-                gained=self.gained[:, at],
-                smooth=self.smooth[:, :, at],
-            )
+            tables = {key: getattr(self, key)[..., at] for key in ("q", "held", "gained", "smooth")}
+            self._alone[joint] = replace(self, **tables)
         return self._alone[joint]
-
-    @cached_property
-    def _alone(self) -> dict[int, Track]:
-        return {}
 
     @property
     def start(self) -> Array:
@@ -142,9 +134,7 @@ def loads(arm: RigidArm, motion: Array, ground: Ground) -> list[Load]:
     q, dq, ddq = 0.5 * (motion[:, 1:] + motion[:, :-1])
     tau = arm.torque(q, dq, ddq)
     weightless, still, found = arm.changed(gravity=np.zeros(3)), np.zeros_like(q), []
-    lift, above = np.zeros_like(q), np.ones(len(q))
-    if ground.root > 0.0:
-        all_above_ground(arm.frames, ground, q, lift, above)
+    lift, above = over_ground(arm, ground, q)
     for j in range(arm.n):
         unit = still.copy()
         unit[:, j] = 1.0
@@ -152,3 +142,12 @@ def loads(arm: RigidArm, motion: Array, ground: Ground) -> list[Load]:
         columns = mass, tau[:, j] - mass * ddq[:, j], lift[:, j], above - lift[:, j] * q[:, j]
         found.append(Load(*map(np.ascontiguousarray, columns)))
     return found
+
+
+def over_ground(arm: RigidArm, ground: Ground, q: Array) -> tuple[Array, Array]:
+    """Tables of `above_ground` for q (m, n) rad: lift (m, n), above (m,)."""
+    q = np.ascontiguousarray(q)
+    lift, above = np.zeros_like(q), np.ones(len(q))
+    if ground.root > 0.0:
+        all_above_ground(arm.frames, ground, q, lift, above)
+    return lift, above

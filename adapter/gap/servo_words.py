@@ -8,7 +8,7 @@ import numpy as np
 from rich.markup import escape
 
 from adapter.gap.phrases import listed, numbered, shown_unit
-from adapter.gap.servo import TITLES, UNITS, ServoFinding, ServoGap
+from adapter.gap.servo import EFFECTS, ServoFinding, ServoGap
 from adapter.gap.servo_model import ground_facts
 from adapter.model.numbers import plain, plus_minus
 
@@ -57,20 +57,20 @@ def _short(finding: ServoFinding) -> str:
     joints = f"joint{'s' if len(finding.joints) > 1 else ''} {numbered(finding.joints)}"
     if finding.effect == "servo_delay":
         return f"commands act {1e3 * finding.values[0]:.2f} ms late"
-    factor, unit = shown_unit(finding.values[0], UNITS[finding.effect][1])
+    factor, unit = shown_unit(finding.values[0], EFFECTS[finding.effect][2])
     values = listed([plain(factor * value, 3) for value in finding.values])
     known = any(value is not None for value in finding.documented)
     than = " is not as documented" if known else ""
-    return f"{TITLES[finding.effect]} of {joints}{than}: {values} {unit}"
+    return f"{EFFECTS[finding.effect][0]} of {joints}{than}: {values} {unit}"
 
 
 def lines(gap: ServoGap) -> list[str]:
     """Headline, a table of findings, figures by joint; for `rich.console.Console.print`."""
     found = [f"[bold]{escape(headline(gap))}[/bold]"]
     for finding in gap.findings:
-        found.append(f"[green]•[/green] {escape(TITLES[finding.effect])}")
+        found.append(f"[green]•[/green] {escape(EFFECTS[finding.effect][0])}")
         rows = zip(finding.joints, finding.values, finding.std, finding.documented, strict=True)
-        factor, unit = shown_unit(finding.values[0], UNITS[finding.effect][1])
+        factor, unit = shown_unit(finding.values[0], EFFECTS[finding.effect][2])
         for j, value, std, documented in rows:
             known = "" if documented is None else f", documented {plain(factor * documented, 4)}"
             said = f"{plus_minus(factor * value, factor * std)} {unit}{known}"
@@ -99,7 +99,7 @@ def as_json(gap: ServoGap) -> dict[str, Any]:
     """What the JSON file holds."""
     findings = []
     for f in gap.findings:
-        key, unit = UNITS[f.effect]
+        _, key, unit = EFFECTS[f.effect]
         findings.append(
             {
                 "effect": f.effect,

@@ -131,7 +131,7 @@ class ViewServer(ThreadingHTTPServer):
         self.socket.close()
         self.socket = listening
         self.page, self.policy, self.newest = page.encode(), policy, Newest()
-        self._places, self._listening = threading.Semaphore(CONNECTIONS), 0
+        self._places, self.listeners = threading.Semaphore(CONNECTIONS), 0
         self._lock = threading.Lock()
         self._heads: dict[Any, float] = {}  # connections whose request is not whole yet
         self._thread = threading.Thread(target=self.serve_forever, args=(0.2,), daemon=True)
@@ -149,24 +149,18 @@ class ViewServer(ThreadingHTTPServer):
         self.shutdown()
         self.server_close()
 
-    @property
-    def listeners(self) -> int:
-        """How many listen now."""
-        with self._lock:
-            return self._listening
-
     def take_listener(self) -> bool:
         """A place for one more, if there is any."""
         with self._lock:
-            if self._listening >= LISTENERS:
+            if self.listeners >= LISTENERS:
                 return False
-            self._listening += 1
+            self.listeners += 1
             return True
 
     def drop_listener(self) -> None:
         """Its place is free again."""
         with self._lock:
-            self._listening -= 1
+            self.listeners -= 1
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """As the base does, for as many as there are places."""

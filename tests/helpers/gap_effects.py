@@ -6,7 +6,7 @@ torque they should read. All signals are (m, n) tables at the times t (m,) s.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -277,3 +277,21 @@ def predict(
     if np.any(error):
         q, dq, ddq = q - error, dq - slope(t, error), ddq - slope(t, slope(t, error))
     return torque_sensor(effects, t, joint_torque(truth, effects, t, q, dq, ddq))
+
+
+def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
+    """The effect of a canonical entry: effect, joints, interval_s, parameters.
+
+    No other key counts.
+
+    Raises:
+        ValueError: unknown name, a key that is missing, unknown or not a number.
+    """
+    if isinstance(entry, Effect):
+        return entry
+    if "effect" not in entry or "parameters" not in entry:
+        raise ValueError(f"an effect entry has {sorted(entry)}; needs: effect, parameters")
+    span = entry.get("interval_s")
+    interval = None if span is None else (float(span[0] or 0.0), span[1])
+    joints = tuple(entry.get("joints") or ())
+    return Effect(entry["effect"], joints, entry["parameters"], interval)

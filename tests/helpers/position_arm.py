@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.gap.servo import UNITS, ServoGap
+from adapter.gap.servo import EFFECTS, ServoGap
 from adapter.gap.servo_model import ServoModel
 from drivers.files.mcap import Commands, Log, McapWriter
 from sim.dynamics import Frames, compiled, end_effector, mass_matrix, torques
@@ -220,7 +220,7 @@ class PositionArm:
     @property
     def expected(self) -> set[tuple[str, int]]:
         """(effect, joint from 1) of all that is to be named where nobody documented the servos."""
-        alone = [e for e in UNITS if self.servos.feeds_speed or e != "viscous_friction"]
+        alone = [e for e in EFFECTS if self.servos.feeds_speed or e != "viscous_friction"]
         return {(effect, j + 1) for effect in alone for j in range(self.truth.n)}
 
 

@@ -13,12 +13,12 @@ from adapter.model.robots import documented as known
 from adapter.model.robots import facts_of as facts_about
 from drivers.interface import JointSample
 from sim.dynamics import end_effector
-from sim.effects import effect_from
 from sim.joint_effects import Obstacles
 from sim.noise import BAND_HZ, RATE_HZ, SensorNoise, band_response, levels_of
 from sim.options import ROBOTS, SCENARIOS
 from sim.scenarios import build
 from sim.truth import FLANGE, facts_of, panda, turn
+from tests.helpers.gap_effects import effect_from
 
 T_S = 1e-3
 

@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 
 from sim import joint_effects
-from sim.effects import SPECS, Effect, effect_from
+from sim.effects import SPECS, Effect
 from sim.joint_effects import Row
 from sim.noise import levels_of
 from sim.plant import Plant
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model, rms
-from tests.helpers.gap_effects import joint_torque, rnea, torque_sensor
+from tests.helpers.gap_effects import effect_from, joint_torque, rnea, torque_sensor
 from tests.sim.test_plant import T_S, reference
 
 SECONDS = 1.0
