@@ -50,24 +50,20 @@ def rigid_truths(truth: Truth, grid_s: float) -> list[tuple[float, Truth]]:
     for start in starts:
         theta, gravity = truth.theta.copy(), truth.gravity
         for effect in bodies:
-            if effect.start_s <= start < effect.end_s:
-                gravity = _work_in(effect, theta, gravity)
+            if not effect.start_s <= start < effect.end_s:
+                continue
+            if effect.name == "payload":
+                theta[-1] += payload_theta(effect)
+            elif effect.name == "link_inertia":
+                dtheta = np.asarray(effect.parameters["dtheta"], float)
+                theta[effect.columns(len(theta))[0]] += dtheta
+            else:  # the base is turned by the rotation vector [rx, ry, 0]
+                rx, ry = effect.number("rx"), effect.number("ry")
+                angle, way = float(np.hypot(rx, ry)), float(np.arctan2(ry, rx))
+                gravity = (turn(2, way) @ turn(0, angle) @ turn(2, -way)).T @ gravity
         rigid = truth.with_changes(theta=theta, gravity=gravity, effects=())
         out.append((start - grid_s / 2, rigid))
     return out
-
-
-def _work_in(effect: Effect, theta: Array, gravity: Array) -> Array:
-    """Add an effect to theta (n, 10) in place; gravity (3,) as it is seen from then on."""
-    if effect.name == "payload":
-        theta[-1] += payload_theta(effect)
-    elif effect.name == "link_inertia":
-        theta[effect.columns(len(theta))[0]] += np.asarray(effect.parameters["dtheta"], float)
-    else:  # the base is turned by the rotation vector [rx, ry, 0]
-        rx, ry = effect.number("rx"), effect.number("ry")
-        angle, way = float(np.hypot(rx, ry)), float(np.arctan2(ry, rx))
-        gravity = (turn(2, way) @ turn(0, angle) @ turn(2, -way)).T @ gravity
-    return gravity
 
 
 def payload_theta(load: Effect) -> Array:
@@ -85,7 +81,14 @@ def load(start_s: float, truth: Truth, period_s: float) -> ArmClient:
     """
     moments = np.array([_checked(truth, j) for j in range(truth.n)])
     client = bullet.connect(bullet.DIRECT)
-    arm = load_urdf(urdf(truth.with_changes(theta=_round_bodies(truth))), client, fixed=True)
+    rounder = truth.theta.copy()  # bodies that the reader takes, axes and centres unchanged
+    for j in range(truth.n):
+        m, c, inertia = body_of(truth.theta[j])
+        three, axes = principal(inertia)
+        spread = 0.1 * np.array([1.0, 1.1, 1.2]) * max(three.max(), 1e-9)
+        round_ = axes @ np.diag(spread) @ axes.T
+        rounder[j, 4:] = theta_of(m, c.tolist(), round_[np.triu_indices(3)].tolist())[4:]
+    arm = load_urdf(urdf(truth.with_changes(theta=rounder)), client, fixed=True)
     # The reader of URDF files sets moments to zero that no rigid body has, learned ones among
     # them; set one by one they are kept.
     for j, three in enumerate(moments.tolist()):
@@ -151,15 +154,3 @@ def _checked(truth: Truth, j: int) -> Array:
             "a simulated body needs them from 0 up"
         )
     return np.maximum(moments, 0.0)
-
-
-def _round_bodies(truth: Truth) -> Array:
-    """theta (n, 10) with bodies that PyBullet's reader takes, axes and centres unchanged."""
-    out = truth.theta.copy()
-    for j in range(truth.n):
-        m, c, inertia = body_of(truth.theta[j])
-        moments, axes = principal(inertia)
-        spread = 0.1 * np.array([1.0, 1.1, 1.2]) * max(moments.max(), 1e-9)
-        round_ = axes @ np.diag(spread) @ axes.T
-        out[j, 4:] = theta_of(m, c.tolist(), round_[np.triu_indices(3)].tolist())[4:]
-    return out

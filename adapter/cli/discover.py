@@ -49,7 +49,13 @@ def run(args: argparse.Namespace) -> int:
             "arbitrary": schema.freedom.words(tree),
         }
         _print_lambda(learned, known)
-        _print_mountings(found)
+        rows = []  # where sensors that do not turn about their z sit in their joints' frames
+        for name, mounting in found.mountings.items():
+            numbers = (mounting.axis, mounting.as_dict()["position"])
+            rows.append((name, *(" ".join(f"{x:6.3f}" for x in row) for row in numbers)))
+        if rows:
+            heads = "sensor of", "axis in its frame", "x y z in the joint's frame, m"
+            _print_table(heads, rows)
         if args.model is not None:
             figures.update(_write_model(args, found, learned))
     write_json(args.json, figures)
@@ -102,16 +108,6 @@ def _print_lambda(learned: discovery.LearnedTree, known: np.ndarray) -> None:
     _print_table(("joint", "α β γ rad", "p m", "shown", "± rad, m"), rows)
     for sentence in schema.freedom.words(tree):
         show(f"arbitrary, as no motion shows it: {sentence}")
-
-
-def _print_mountings(found: discovery.Discovery) -> None:
-    """Where sensors that do not turn about their z sit in their joints' frames."""
-    rows = []
-    for name, mounting in found.mountings.items():
-        numbers = (mounting.axis, mounting.as_dict()["position"])
-        rows.append((name, *(" ".join(f"{x:6.3f}" for x in row) for row in numbers)))
-    if rows:
-        _print_table(("sensor of", "axis in its frame", "x y z in the joint's frame, m"), rows)
 
 
 def _print_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

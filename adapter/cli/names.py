@@ -39,24 +39,19 @@ def effects_named(text: str) -> tuple[str, ...]:
     names: dict[str, None] = {}
     for name in (name.strip() for name in text.split(",") if name.strip()):
         if name.endswith(".toml"):
-            names.update(dict.fromkeys(_learned_of(Path(name))))
+            for law in read_kept(Path(name)):
+                if law.in_files not in LEARNABLE:
+                    raise SettingsError(
+                        f"{name}: [{law.name}] is c {law.in_files.removeprefix(LAW)}: its size is "
+                        "not learned online; a model that has it, from adapter gap, keeps it as it "
+                        "is"
+                    )
+                names[law.in_files] = None
             continue
         if name != "real" and name not in LEARNABLE:
             raise SettingsError(f"no effect '{name}'; {choices(name, ('none', 'real', *LEARNED))}")
         names.update(dict.fromkeys(REAL_ARM_EFFECTS if name == "real" else [name]))
     return tuple(names)
-
-
-def _learned_of(path: Path) -> list[str]:
-    """Laws of a file of kept ones."""
-    kept = read_kept(path)
-    for law in kept:
-        if law.in_files not in LEARNABLE:
-            raise SettingsError(
-                f"{path}: [{law.name}] is c {law.in_files.removeprefix(LAW)}: its size is not "
-                "learned online; a model that has it, from adapter gap, keeps it as it is"
-            )
-    return [law.in_files for law in kept]
 
 
 def check_learning(args: argparse.Namespace) -> None:

@@ -44,23 +44,18 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         },
     }
     noise = "  ".join(f"{std:.2g}" for std in told.torque_std)
+    parts: dict[str, list[str]] = {}  # of each link and joint what is shown, and how well
+    for name, value in figures["parameters"].items():
+        part, _, what = name.partition(" ")
+        said = parts.setdefault(part, [])
+        if value["shown"]:
+            said.append(f"{what} ±{value['std']:.2g} {value['unit']}")
     lines = [
         f"can be learned from: {teaches}",
         f"{robot.name}: tells {told.rank} of the {told.full_rank} combinations of parameters that "
         "torques depend on",
         f"torque that no parameters explain, N m: {noise}",
         *(f"missing: {sentence}" for sentence in told.missing),
-        *_by_part(figures["parameters"]),
+        *(f"{part}: {', '.join(said) or 'nothing shown'}" for part, said in parts.items()),
     ]
     return figures, [*locked, *doubt, *lines]
-
-
-def _by_part(parameters: dict[str, Any]) -> list[str]:
-    """A line for each link and joint: standard deviation of what is shown of it."""
-    parts: dict[str, list[str]] = {}
-    for name, value in parameters.items():
-        part, _, what = name.partition(" ")
-        said = parts.setdefault(part, [])
-        if value["shown"]:
-            said.append(f"{what} ±{value['std']:.2g} {value['unit']}")
-    return [f"{part}: {', '.join(said) or 'nothing shown'}" for part, said in parts.items()]

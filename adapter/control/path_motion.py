@@ -209,12 +209,7 @@ def ramp_pairs(settings: ExcitationSettings) -> Array:
         rate = np.outer(first, value)
         bend = np.outer((1.0 - slow) * slope, value) + np.outer(first, slope)
         found += zip((rate**2).ravel(), (bend / ramp).ravel(), strict=True)
-    return _corners(np.array(found))
-
-
-def _corners(pairs: Array) -> Array:
-    """Those pairs (p, 2) that are largest in some direction with both parts positive."""
-    kept: list[Array] = []
+    pairs, kept = np.array(found), list[Array]()  # those largest in some direction are enough
     for pair in pairs[np.lexsort((-pairs[:, 1], -pairs[:, 0]))]:  # falling first parts
         if kept and pair[1] <= kept[-1][1]:
             continue

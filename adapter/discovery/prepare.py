@@ -260,7 +260,11 @@ def _resampled(log: Log, t_s: Array, rows: np.ndarray, channels: Channels) -> _E
     period_s = float(np.median(np.diff(t_s)))
     grid: Array = np.asarray(period_s * np.arange(int(np.floor(t_s[-1] / period_s + 1e-6)) + 1))
     even = _EvenSignals(1.0 / period_s, np.ones(len(grid), dtype=bool))
-    for name, values in (("q", _unwrapped(log.q[rows])), ("dq", log.dq[rows])):
+    q = log.q[rows].copy()
+    for column in q.T:  # no filter would survive the jumps of whole turns
+        known = np.isfinite(column)
+        column[known] = np.unwrap(column[known])
+    for name, values in (("q", q), ("dq", log.dq[rows])):
         if name == "q" or np.isfinite(values).any(axis=0).all():
             even.joints[name] = _onto(grid, t_s, values, even.heard)
     for channel, values in channels.values.items():
@@ -270,20 +274,20 @@ def _resampled(log: Log, t_s: Array, rows: np.ndarray, channels: Channels) -> _E
         )
     heard_s = float(even.heard.sum() * period_s)
     if heard_s < SHORTEST_S:
-        raise SettingsError(_not_together(log, heard_s, channels))
+        tables = [table for table in (log.twists, log.accels) if table is not None]
+        counts = []
+        for k, name in enumerate(log.link_names):
+            share = min(float(np.isfinite(table[:, k]).any(axis=1).mean()) for table in tables)
+            counts.append(f"{name} {100 * share:.0f} %")
+        raise SettingsError(
+            f"{log.path}: only {heard_s:.2f} s have all of {', '.join(channels.values)} of every "
+            "link and all joint signals at the same time; stamps with link motion: "
+            f"{', '.join(counts)}"
+        )
     torque = log.tau[rows]
     if np.isfinite(torque).any(axis=0).all():
         even.tau = _onto(grid, t_s, torque, even.heard.copy())
     return even
-
-
-def _unwrapped(q: Array) -> Array:
-    """q (k, n) without the jumps of whole turns, which no filter would survive."""
-    out = q.copy()
-    for column in out.T:
-        heard = np.isfinite(column)
-        column[heard] = np.unwrap(column[heard])
-    return out
 
 
 def _onto(grid: Array, t_s: Array, values: Array, heard: np.ndarray) -> Array:
@@ -298,19 +302,6 @@ def _onto(grid: Array, t_s: Array, values: Array, heard: np.ndarray) -> Array:
     outside = (grid < known[0] - GAP_S) | (grid > known[-1] + GAP_S)
     heard &= (gap_s <= GAP_S) & ~outside
     return np.stack([np.interp(grid, known, column) for column in values[finite].T], axis=1)
-
-
-def _not_together(log: Log, heard_s: float, channels: Channels) -> str:
-    """The sentence on signals that were never heard at the same time."""
-    tables = [table for table in (log.twists, log.accels) if table is not None]
-    counts = []
-    for k, name in enumerate(log.link_names):
-        share = min(float(np.isfinite(table[:, k]).any(axis=1).mean()) for table in tables)
-        counts.append(f"{name} {100 * share:.0f} %")
-    return (
-        f"{log.path}: only {heard_s:.2f} s have all of {', '.join(channels.values)} of every link "
-        f"and all joint signals at the same time; stamps with link motion: {', '.join(counts)}"
-    )
 
 
 # --- one filter for all, and the noise it leaves -----------------------------------------------

@@ -205,14 +205,19 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
     order = {name: k for k, name in enumerate(bodies.log.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
-    single = len(roots) == 1
+    single, used = len(roots) == 1, {option.joint for option in structure.chosen}
     return Discovery(
         root=next(iter(roots)) if single else None,
         root_confidence=next(iter(roots.values())) if single else 0.0,
         edges=kept,
         undecided=(
             *_resting(bodies),
-            *_idle(bodies, structure),
+            *(
+                f"joint {name} moves no link whose motion is in the recording; record the motion "
+                "of the link that it moves"
+                for s, name in enumerate(bodies.log.joint_names)
+                if s not in used
+            ),
             *_roots(bodies, structure),
             *_either_way(bodies, shares),
             *_undecided(bodies, structure, posterior, shares, confidence),
@@ -285,17 +290,6 @@ def _resting(bodies: Bodies) -> Iterator[str]:
             "its noise): which link it moves follows only from what the other joints leave over; "
             "move it"
         )
-
-
-def _idle(bodies: Bodies, structure: Structure) -> Iterator[str]:
-    used = {option.joint for option in structure.chosen}
-    log = bodies.log
-    for s, name in enumerate(log.joint_names):
-        if s not in used:
-            yield (
-                f"joint {name} moves no link whose motion is in the recording; record the motion "
-                "of the link that it moves"
-            )
 
 
 def _roots(bodies: Bodies, structure: Structure) -> Iterator[str]:

@@ -389,7 +389,13 @@ def _paying(task: GapTask, found: Found) -> Found:
             ways += [fewer, uncorrected(fewer)]
     best = min((_Scored.of(task, x, level) for x in ways), key=lambda x: x.cost)
     while best.worse.any() and best.found.fit.named:
-        less = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
+        fit, less = best.found.fit, []
+        for k, e in enumerate(fit.named):  # less one effect that acts on one of these joints
+            size = np.abs(fit.model.contribution(e.recording or 0, k)).max(axis=0)
+            if not from_the_start(e) and (size[best.worse] > 0.1 * size.max()).any():
+                fewer = _without(best.found, (k,))
+                fewer = fewer if fit.dtheta.any() else uncorrected(fewer)
+                less.append(_Scored.of(task, fewer, level))
         if not less or min(x.cost for x in less) > best.cost:
             break
         best = min(less, key=lambda x: x.cost)
@@ -405,19 +411,6 @@ def _without(found: Found, places: Collection[int]) -> Found:
     return replace(
         found, fit=fit, carried=carried, standings=standings, weak=weak, known=None, under=None
     )
-
-
-def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
-    """What was found less one effect that acts on one of these joints (n,), for each of those."""
-    fit, out = found.fit, []
-    for k in range(len(fit.named)):
-        if from_the_start(fit.named[k]):
-            continue
-        size = np.abs(fit.model.contribution(fit.named[k].recording or 0, k)).max(axis=0)
-        if (size[joints] > 0.1 * size.max()).any():  # a joint that it acts on
-            less = _without(found, (k,))
-            out.append(less if fit.dtheta.any() else uncorrected(less))
-    return out
 
 
 def uncorrected(found: Found) -> Found:

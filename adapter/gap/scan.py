@@ -134,7 +134,11 @@ class SignatureTable:
         tables, noise = [], []
         extra = self._patterns(fit, joints) if kind == PATTERNS else []
         stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
-        lawful = joints if kind != CATALOGUED else self._rivalled(fit, joints)
+        lawful = list(joints)
+        if kind == CATALOGUED:  # those that have a law, or an effect that one may be taken for
+            named = [e.candidate for e in fit.named if not e.assumed]
+            rivalled = [c.joint for c in named if isinstance(c.effect, Law) or c.effect.over_angle]
+            lawful = sorted({*rivalled} & {*joints})
         extra += [way for j in lawful for way in laws(stages, j)]
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
@@ -159,12 +163,6 @@ class SignatureTable:
     def X(self) -> Array:
         """(c, r) all signatures, white."""
         return self.fit.whiten(self.tables)
-
-    def _rivalled(self, fit: Fit, joints: Sequence[int]) -> list[int]:
-        """Joints that have a law, or an effect that one may be taken for."""
-        named = [e for e in fit.named if e.candidate.joint in joints and not e.assumed]
-        effects = [(e.candidate.joint, e.candidate.effect) for e in named]
-        return sorted({j for j, effect in effects if isinstance(effect, Law) or effect.over_angle})
 
     def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int, Template]]:
         """Patterns of each joint, and lines in time."""

@@ -74,13 +74,6 @@ class _Together:
         point = np.ascontiguousarray(x[:3])
         return Ground(self.link, point, up, float(x[3]), float(np.exp(np.clip(x[4], -9.0, 9.0))))
 
-    def start(self, beyond_m: float) -> Array:
-        """(5,) from a point so far beyond the centre of mass, which touches at its lowest."""
-        point = self.beyond(beyond_m)
-        level = self.ground(np.array([*point / SIZE[:3], 0.0, 0.0]))
-        heights = np.concatenate([over_ground(self.arm, level, q)[1] for q in self.middles])
-        return np.array([*point, np.quantile(heights, LOWEST), 0.5 * np.log(STIFF)]) / SIZE
-
     def under(self, ground: Ground) -> list[JointTask]:
         """The tasks with it."""
         tables = []
@@ -146,19 +139,6 @@ class _Together:
         errors = np.array([self.errors(self.ground(y), x) for x in servos])
         return np.array(servos)[errors.argmin(axis=0), np.arange(self.arm.n)]
 
-    def refitted(self, y: Array, servos: Sequence[Array]) -> Array:
-        """(n, 6) the best of the fits from each, the ground as it is."""
-        tasks = self.under(self.ground(y))
-        fits = [
-            np.array([fit_joint(t, ALL_FREE, own).x for t, own in zip(tasks, x, strict=True)])
-            for x in servos
-        ]
-        return self.best_of(y, fits)
-
-    def part(self, half: int) -> _Together:
-        """On every second block of time."""
-        return replace(self, tasks=[blocks(task, half) for task in self.tasks])
-
 
 def robust_fit(
     left: Callable[[Array], Array],
@@ -211,22 +191,33 @@ def find_ground(arm: RigidArm, tasks: Sequence[JointTask], x: Array) -> tuple[Gr
         starts.append(np.array([fit_joint(t, ALL_FREE, first_guess(t)).x for t in each]))
     for link, beyond in product(range(max(arm.n - 2, 0), arm.n), BEYOND_M):
         one = _Together(arm, tasks, link)
-        y, servos, cost = one.start(beyond), x, np.inf
+        point = one.beyond(beyond)  # which touches at its lowest
+        level = one.ground(np.array([*point / SIZE[:3], 0.0, 0.0]))
+        heights = np.concatenate([over_ground(arm, level, q)[1] for q in one.middles])
+        y = np.array([*point, np.quantile(heights, LOWEST), 0.5 * np.log(STIFF)]) / SIZE
+        servos, cost = x, np.inf
         for _ in range(2):  # a joint that got stuck starts again, beside the ground as it is now
             y, servos, cost = one.fit(y, one.best_of(y, [servos, *starts]), ROUGH)
         if cost < least:
             best, least = (one, y, servos), cost
     assert best is not None
     one, y, servos = best
-    y, servos, _ = one.fit(y, one.refitted(y, [servos, *starts]), FINE)
+    beside = one.under(one.ground(y))
+    fits = [
+        np.array([fit_joint(t, ALL_FREE, own).x for t, own in zip(beside, each, strict=True)])
+        for each in (servos, *starts)
+    ]
+    y, servos, _ = one.fit(y, one.best_of(y, fits), FINE)
     none = np.array([0.0, 0.0, 0.0, -1e3, 0.0])  # far below
     pairs = zip(one.under(one.ground(y)), servos, strict=True)
     gain, unit = np.zeros(arm.n), np.array([chi2_unit(task, own) for task, own in pairs])
     for half in (0, 1):
-        seen, unseen = one.part(half), one.part(1 - half)
-        with_it, beside = seen.fit(y, servos, ROUGH)[:2]
+        seen, unseen = (
+            replace(one, tasks=[blocks(task, part) for task in tasks]) for part in (half, 1 - half)
+        )
+        with_it, own = seen.fit(y, servos, ROUGH)[:2]
         without = seen.fit(none, x, ROUGH)[1]
-        gain += unseen.errors(NO_GROUND, without) - unseen.errors(seen.ground(with_it), beside)
+        gain += unseen.errors(NO_GROUND, without) - unseen.errors(seen.ground(with_it), own)
     if np.sum(gain / unit > PAYS_CHI2) < LEAST_JOINTS or gain.sum() < 0.0:
         return NO_GROUND, x
     return one.ground(y), servos

@@ -204,7 +204,15 @@ class LearnedFeedforward(EstimateFollower, Feedforward):
                 before = self._learned()
                 effects = np.nan_to_num(snapshot.effects)
                 self._model.set(snapshot.lam, theta, effects, snapshot.effect_shapes)
-                self._fade_from(before)
+                # from what was said before to what the new parameters say
+                self._left = 0
+                if self.ready and self._trust > 0.0:
+                    self._jump, self._left = before - self._learned(), FADE_CALLS
+                self.ready = True
+                if self._bound is not None and self._trust == 0.0:
+                    q, dq, ddq = self._asked
+                    apart = np.abs(self._model(q, dq, ddq) - self._bound.model(q, dq, ddq))
+                    self._believed = bool((apart <= RETURN_SHARE * self._most).all())
                 self._std = snapshot.theta_std
         if self.ready and self._bound is not None:
             q, dq, ddq = self._asked
@@ -216,17 +224,6 @@ class LearnedFeedforward(EstimateFollower, Feedforward):
         return np.array(
             [moving, self._model.unbent(self._asked[0]) + self._jump[1] * self._left / FADE_CALLS]
         )
-
-    def _fade_from(self, before: Array) -> None:
-        """From what was said before to what the new parameters say."""
-        self._left = 0
-        if self.ready and self._trust > 0.0:
-            self._jump, self._left = before - self._learned(), FADE_CALLS
-        self.ready = True
-        if self._bound is not None and self._trust == 0.0:
-            q, dq, ddq = self._asked
-            apart = np.abs(self._model(q, dq, ddq) - self._bound.model(q, dq, ddq))
-            self._believed = bool((apart <= RETURN_SHARE * self._most).all())
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion."""

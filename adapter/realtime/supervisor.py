@@ -124,7 +124,16 @@ class Supervisor:
         for worker in (*first, self.display):
             if worker is not None:
                 worker.wait_ready(cancelled=cancelled)
-        self._wait_for_view(cancelled)
+        if self.view is None or self.view.worker is None:
+            return
+        try:  # a run does without one that cannot show
+            self.view.worker.wait_ready(cancelled=cancelled)
+        except WorkerError as error:
+            if cancelled():
+                raise
+            self.view.kill()
+            self.view = None
+            self._tell(f"{error}; the arm goes on, nothing is shown")
 
     def _start_displays(self, board: str | None) -> None:
         jobs, shown = self._jobs, self.states or self.samples
@@ -139,19 +148,6 @@ class Supervisor:
             build = partial(Worker, name, task, self._cores)
             lost = "nothing more is shown"
             self.view = self._restartable(name, lambda k: build(), RESTARTS, lost)
-
-    def _wait_for_view(self, cancelled: Callable[[], bool]) -> None:
-        """Until it shows; a run does without one that cannot."""
-        if self.view is None or self.view.worker is None:
-            return
-        try:
-            self.view.worker.wait_ready(cancelled=cancelled)
-        except WorkerError as error:
-            if cancelled():
-                raise
-            self.view.kill()
-            self.view = None
-            self._tell(f"{error}; the arm goes on, nothing is shown")
 
     def _start_learner(self, job: LearnerJob, ring: Ring, board: str) -> RestartableWorker:
         lasting = job.keep is not None and job.restore is not None

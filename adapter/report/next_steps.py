@@ -42,7 +42,13 @@ def next_steps(data: RunData, worth: Worth) -> list[Step]:
         return [Step(why, command("replay", *files.logs or ["LOG"]))]
     started = theta_started(data)
     found: list[Step | None] = []
-    if _left_to_find(data, worth):
+    fall, slow = worth.torque, slow_share(data) if started else None
+    if (
+        (fall is not None and (fall.before is None or fall.better))
+        or not_learned(data.figures)
+        or worth.loads
+        or (slow is not None and float(slow.max()) > SLOW)
+    ):
         found.append(files.gap("Name what the documented model lacks, with its evidence"))
     if not started or data.figures["theta"].get("converged_s") is None:
         found.append(_longer(data, files))
@@ -69,18 +75,6 @@ class _Files:
     def gap(self, why: str) -> Step:
         logs = self.logs or ["LOG"]
         return Step(why, command("gap", *logs, "--model", self.documented))
-
-
-def _left_to_find(data: RunData, worth: Worth) -> bool:
-    """Whether the documented model explains torque worse than the learned one, or something is
-    new or left."""
-    fall, slow = worth.torque, slow_share(data) if theta_started(data) else None
-    return bool(
-        (fall is not None and (fall.before is None or fall.better))
-        or not_learned(data.figures)
-        or worth.loads
-        or (slow is not None and float(slow.max()) > SLOW)
-    )
 
 
 def _longer(data: RunData, files: _Files) -> Step:

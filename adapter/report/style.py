@@ -286,7 +286,12 @@ def _svg(figure: Figure, told: str, size: str) -> Markup:
     body = re.sub(r"<style.*?</style>", "", body, flags=re.S)
     body = body.replace("xlink:href", "href")
     body = re.sub(rf'<g id="{NAMED}([^"]*)">', r"<g><title>\1</title>", body)
-    body = _own_ids(body, f"f{next(Drawing._numbers)}-")
+    # ids that are referred to get a prefix, so that they are the page's only ones; the rest go
+    prefix = f"f{next(Drawing._numbers)}-"
+    for name in set(re.findall(r"[\"(]#([\w.-]+)", body)):
+        body = body.replace(f'id="{name}"', f"\0{prefix}{name}\0")
+        body = re.sub(rf'(["(])#{re.escape(name)}(?=[")])', rf"\1#{prefix}{name}", body)
+    body = re.sub("\0([^\0]*)\0", r'id="\1"', re.sub(r' id="[^"]*"', "", body))
     body = re.sub(r'\bd="[^"]*"', lambda found: _rounded(found.group(0), 1), body)
     body = re.sub(r'(?<= d=)"[ML][-\d. MLz\n]*"', lambda found: _short(found.group(0)), body)
     body = re.sub(r"<[^>]*>", lambda found: _rounded(found.group(0), 2), body)  # not the text
@@ -297,16 +302,6 @@ def _svg(figure: Figure, told: str, size: str) -> Markup:
         body = body.replace(color, f"var(--{name})")
     head = f'<svg class="{size}" viewBox="{box.group(1)}" role="img"{told}>'
     return Markup(f"{head}{body}</svg>")
-
-
-def _own_ids(body: str, prefix: str) -> str:
-    """Ids that are referred to get a prefix, so that they are the page's only ones; the rest go."""
-    used = set(re.findall(r"[\"(]#([\w.-]+)", body))
-    for name in used:
-        body = body.replace(f'id="{name}"', f"\0{prefix}{name}\0")
-        body = re.sub(rf'(["(])#{re.escape(name)}(?=[")])', rf"\1#{prefix}{name}", body)
-    body = re.sub(r' id="[^"]*"', "", body)
-    return re.sub("\0([^\0]*)\0", r'id="\1"', body)
 
 
 def _short(path: str) -> str:

@@ -304,25 +304,17 @@ def _effects(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
         units = (was or now)[0].effect.units()
         others = [a for key, found in tables[0].items() if key != at for a in found]
         changed = replace(first, effects=tuple(_entry(a) for a in (*others, *now)))
-        yield Change(at[1], *names[at[0]], values, units, _largest_z(values, *std)), changed
+        z = []  # a number that is not there is zero
+        for key, (a, b) in values.items():
+            stds = (np.atleast_1d(np.asarray(s.get(key) or 0.0, dtype=float)) for s in std)
+            apart = np.subtract(0.0 if b is None else b, 0.0 if a is None else a)
+            z.append(_z(np.atleast_1d(apart), *stds))
+        largest = max((x for x in z if x is not None), default=None)
+        yield Change(at[1], *names[at[0]], values, units, largest), changed
 
 
 def _same(a: Any, b: Any) -> bool:
     return a is not None and b is not None and np.allclose(a, b, rtol=SAME, atol=0.0)
-
-
-def _largest_z(
-    values: Mapping[str, tuple[Any, Any]], *stds: Mapping[str, float | None]
-) -> float | None:
-    """Largest difference of numbers in standard deviations; a number that is not there is zero."""
-    found = [
-        _z(
-            np.atleast_1d(np.subtract(0.0 if b is None else b, 0.0 if a is None else a)),
-            *(np.atleast_1d(np.asarray(std.get(key) or 0.0, dtype=float)) for std in stds),
-        )
-        for key, (a, b) in values.items()
-    ]
-    return max((z for z in found if z is not None), default=None)
 
 
 def _entry(active: Active) -> dict[str, Any]:

@@ -129,6 +129,11 @@ def collect(learner: OnlineLearner) -> Outcome:
     excess = float(np.sqrt(np.mean(theta.variance() / theta.variance(batch))))
     known = learner.posterior()
     bodies, information = theta.theta_given(known.effects)
+    # λ's course: the learner keeps frames, since reading λ off them takes longer
+    n, rows = learner.tree.n, learner.schema_trace.rows
+    angles = zxz_from_matrix(rows[:, 1 : 1 + 9 * n].reshape(-1, n, 3, 3))
+    lam = np.concatenate([angles, rows[:, 1 + 9 * n : 1 + 12 * n].reshape(-1, n, 3)], axis=2)
+    course = np.concatenate([rows[:, :1], lam.reshape(len(rows), 6 * n)], axis=1)
     return Outcome(
         learned=learner.learned,
         start_lam=schema.start_lam,
@@ -157,7 +162,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         payload=known.payload,
         changes_ns=tuple(learner.changes),
         rebuilds=learner.rebuilds,
-        schema_trace=_course_of_lam(learner),
+        schema_trace=course,
         schema_known=learner.schema_trace.rows[:, 1 + 12 * learner.tree.n :].copy(),
         lam_information=in_parents(schema.R0, schema.information),
         theta_trace=learner.theta_trace.rows.copy(),
@@ -168,14 +173,6 @@ def collect(learner: OnlineLearner) -> Outcome:
         disagreements=None if learner.watch is None else tuple(learner.watch.reports),
         verdict=learner.verdict,
     )
-
-
-def _course_of_lam(learner: OnlineLearner) -> Array:
-    """Rows [stamp ns, λ]; the learner keeps frames, since reading λ off them takes longer."""
-    n, rows = learner.tree.n, learner.schema_trace.rows
-    angles = zxz_from_matrix(rows[:, 1 : 1 + 9 * n].reshape(-1, n, 3, 3))
-    lam = np.concatenate([angles, rows[:, 1 + 9 * n : 1 + 12 * n].reshape(-1, n, 3)], axis=2)
-    return np.concatenate([rows[:, :1], lam.reshape(len(rows), 6 * n)], axis=1)
 
 
 def completed_lambda(outcome: Outcome, documented: SelfModel) -> tuple[Array, list[str]]:

@@ -210,7 +210,10 @@ def _with_joints(log: Log, spec: ImportSpec) -> Log:
     if not want:
         return log
     found, said = corresponding(want, have, "joint")
-    if len(want) == len(have) and not any(found) and not _crossed(want, have):
+    words = [[set(re.findall("[a-z]{3,}", name.casefold())) for name in x] for x in (want, have)]
+    shared = [[j for j, own in enumerate(words[1]) if own & other] for other in words[0]]
+    crossed = any(len(at) == 1 and at != [i] for i, at in enumerate(shared))  # words they share
+    if len(want) == len(have) and not any(found) and not crossed:
         pairs = ", ".join(f"{a} = {b}" for a, b in zip(have, want, strict=True))
         said = [
             f"joint names differ and are matched by their order: {pairs} (else --names A=B,...)"
@@ -243,13 +246,6 @@ def _renamed(log: Log, spec: ImportSpec) -> list[str]:
     if twice:
         raise DriverError(f"{log.path}: --names calls two joints {twice[0]}")
     return called
-
-
-def _crossed(want: tuple[str, ...], have: tuple[str, ...]) -> bool:
-    """Whether words that names share speak against the order."""
-    words = [[set(re.findall("[a-z]{3,}", name.casefold())) for name in x] for x in (want, have)]
-    shared = [[j for j, own in enumerate(words[1]) if own & other] for other in words[0]]
-    return any(len(at) == 1 and at != [i] for i, at in enumerate(shared))
 
 
 def _stamp_doubts(

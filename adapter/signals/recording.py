@@ -120,14 +120,6 @@ def _of_servos(log: Log) -> bool:
     return log.commands is not None and log.commands.q is not None and bool(np.isnan(log.tau).all())
 
 
-def _tracking_error(log: Log) -> list[float]:
-    """Rms of command less position of each joint, rad; a command holds until the next."""
-    assert log.commands is not None and log.commands.q is not None
-    at = np.searchsorted(log.commands.stamp_ns, log.stamp_ns, side="right") - 1
-    error = log.commands.q[at[at >= 0]] - log.q[at >= 0]
-    return np.sqrt(np.mean(error**2, axis=0)).tolist() if len(error) else []
-
-
 def summary(facts: dict[str, Any]) -> list[str]:
     """The facts of `describe` in about ten lines."""
     topics = facts["topics"]
@@ -223,7 +215,12 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
     signals = dict(zip(("q_rad", "dq_rad_s", "tau_nm"), tables, strict=True))
     q, dq, tau = signals.values()
     judged = ["q", "dq", "tau"]
-    if of_servos := _of_servos(log):
+    tracking_error_rad = None
+    if _of_servos(log):
+        assert log.commands is not None and log.commands.q is not None
+        at = np.searchsorted(log.commands.stamp_ns, log.stamp_ns, side="right") - 1
+        error = log.commands.q[at[at >= 0]] - log.q[at >= 0]  # a command holds until the next
+        tracking_error_rad = np.sqrt(np.mean(error**2, axis=0)).tolist() if len(error) else []
         signals, judged = {"q_rad": q}, ["q"]
         dq = np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts])
     repeated = 0
@@ -243,7 +240,7 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
         "samples_judged": sum(map(len, parts)),
         "commands": looked.commands,
         "commanded": "positions" if log.commands and log.commands.q is not None else "torques",
-        "tracking_error_rad": _tracking_error(log) if of_servos else None,
+        "tracking_error_rad": tracking_error_rad,
         "repeated_samples": repeated,
         "not_finite": int((~finite).sum()),
         "range": {

@@ -230,7 +230,14 @@ class DamiaoArm:
         if whole:
             self._speed.add(stamp_ns, q, dq)
             if self._driving:
-                self._report(values)
+                # what the arm must be carried with, here and with the guardian
+                self._carried = self._told or [
+                    old + CARRIED_SHARE * (new - old)
+                    for old, new in zip(self._carried, values[2 * n :], strict=True)
+                ]
+                if self._guardian is not None:
+                    parts = values[:n], values[n : 2 * n], self._carried, values[2 * n :]
+                    self._guardian.memory.put(*parts)
         else:
             self._speed.skip()
         self.arrived_ns = self._replies.arrived_ns
@@ -331,17 +338,6 @@ class DamiaoArm:
             self.intake.note(
                 "taken", "no command came for 50 ms; the guardian braked the arm until the next one"
             )
-
-    def _report(self, values: list[float]) -> None:
-        """Keep what the arm must be carried with, here and with the guardian."""
-        n = self._joints
-        self._carried = self._told or [
-            old + CARRIED_SHARE * (new - old)
-            for old, new in zip(self._carried, values[2 * n :], strict=True)
-        ]
-        if self._guardian is not None:
-            q, dq, tau = values[:n], values[n : 2 * n], values[2 * n :]
-            self._guardian.memory.put(q, dq, self._carried, tau)
 
 
 def torque_frames(tau: Array, tau_max: Sequence[float]) -> tuple[list[bytes], bool]:

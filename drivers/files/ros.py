@@ -223,23 +223,18 @@ def decode_many(
             continue
         if len(blocks) < _LAYOUTS_VECTORISED:
             candidates = rows if left.size == len(rows) else rows[left]
-            same = _same_layout(candidates, sample, layout)
+            same, start = np.ones(len(candidates), dtype=np.bool_), 0
+            for run in (_STAMP, *(layout.varying or layout.doubles)):
+                assert isinstance(run, slice)
+                fixed = candidates[:, start : run.start] == sample[start : run.start]
+                if not fixed.all():  # all at once is four times as fast as row by row
+                    same &= fixed.all(axis=1)
+                start = run.stop
         else:
             same = left == left[0]
         blocks.append(_read(rows, left[same], layout))
         left = left[~same]
     return blocks, bad
-
-
-def _same_layout(rows: Rows, sample: NDArray[np.uint8], layout: Layout) -> NDArray[np.bool_]:
-    same, start = np.ones(len(rows), dtype=np.bool_), 0
-    for run in (_STAMP, *(layout.varying or layout.doubles)):
-        assert isinstance(run, slice)
-        fixed = rows[:, start : run.start] == sample[start : run.start]
-        if not fixed.all():  # all at once is four times as fast as row by row
-            same &= fixed.all(axis=1)
-        start = run.stop
-    return same
 
 
 def _read(rows: Rows, index: NDArray[np.int64], layout: Layout) -> Block:

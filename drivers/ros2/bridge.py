@@ -186,7 +186,14 @@ class Bridge:
                 f"{where.states} tells no {' and no '.join(absent)}; the arm's state interfaces "
                 "have to be position, velocity and effort"
             )
-        self._check_rate(first)
+        stamps = [np.frombuffer(data, "<i4", 2, 4).tolist() for data in first]
+        steps = np.diff([sec + 1e-9 * nanosec for sec, nanosec in stamps])
+        hz = 1.0 / max(float(np.median(steps)), 1e-9)
+        if abs(hz / where.hz - 1.0) > RATE_SHARE:
+            raise DriverError(
+                f"{where.states} comes at {hz:.0f} Hz, not {where.hz:.0f}; say hz={hz:.0f} in the "
+                "address"
+            )
         self._braker = Braker(self._effort(), 1.0 / where.hz, where.gravity)
         if self._commands is not None and not self._start.rescue:
             self._check_command(self._commands)
@@ -210,16 +217,6 @@ class Bridge:
                     )
             time.sleep(0.002)
         return found
-
-    def _check_rate(self, first: list[bytes]) -> None:
-        stamps = [np.frombuffer(data, "<i4", 2, 4).tolist() for data in first]
-        steps = np.diff([sec + 1e-9 * nanosec for sec, nanosec in stamps])
-        hz = 1.0 / max(float(np.median(steps)), 1e-9)
-        if abs(hz / self._start.settings.hz - 1.0) > RATE_SHARE:
-            raise DriverError(
-                f"{self._start.settings.states} comes at {hz:.0f} Hz, not "
-                f"{self._start.settings.hz:.0f}; say hz={hz:.0f} in the address"
-            )
 
     def _effort(self) -> Array:
         """(n,) largest torques, from the address or the robot's description."""

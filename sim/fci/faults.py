@@ -23,7 +23,7 @@ from sim.faults import (
     describe,
     read_fault,
 )
-from sim.fci.codec import ERRORS, HOST, JOINTS, PORT, TICK_S, VERSIONS, Floats, StateFrame
+from sim.fci.codec import ERRORS, HOST, JOINTS, PORT, TICK_S, VERSIONS, StateFrame
 from sim.fci.gripper import WIDEST
 from sim.options import add_served, options_of
 from sim.options import check as check_scenario
@@ -83,7 +83,13 @@ class Spoiler:
             if fault.at_s > tick * TICK_S:
                 continue
             if fault.name in ("stuck", "jump"):
-                self._disturb_encoder(fault, frame.fields["q"], frame.fields["theta"])
+                at, q = int(fault.value) - 1, frame.fields["q"]
+                if not self.counts[fault.name]:
+                    self.counts[fault.name] = 1
+                    self._frozen[at] = float(q[at])
+                for reading in (q, frame.fields["theta"]):
+                    jumped = reading[at] + JUMP_RAD
+                    reading[at] = jumped if fault.name == "jump" else self._frozen[at]
             elif fault.name in ("nan", "spike") and self._happens(fault):
                 name = ("q", "dq", "tau_J")[self._rng.integers(3)]
                 joint = self._rng.integers(JOINTS)
@@ -142,17 +148,6 @@ class Spoiler:
         for at in self._rng.integers(len(data), size=self._rng.integers(1, 9)):
             changed[at] ^= int(self._rng.integers(1, 256))
         return bytes(changed)
-
-    def _disturb_encoder(self, fault: Fault, *readings: Floats) -> None:
-        joint = int(fault.value) - 1
-        if not self.counts[fault.name]:
-            self.counts[fault.name] = 1
-            self._frozen[joint] = float(readings[0][joint])
-        for reading in readings:
-            if fault.name == "jump":
-                reading[joint] += JUMP_RAD
-            else:
-                reading[joint] = self._frozen[joint]
 
     def _happens(self, fault: Fault) -> bool:
         hit = bool(self._rng.random() < fault.value)

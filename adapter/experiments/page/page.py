@@ -50,13 +50,23 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
         reasons.append(words.PANDA_LEFT_OUT)
     elif not math.isfinite(panda.theta_start_s):
         reasons.append("Fig. 6b: θ was not learned, it waits until λ has converged.")
+    learned = None
+    if panda is not None:
+        torque, names = figure6.torque_panel(panda), panda.tree.joint_names
+        learned = {
+            "joints": [(j % JOINT_COLORS + 1, name) for j, name in enumerate(names)],
+            "lambda": figure6.lambda_panels(panda),
+            "theta": [*figure6.theta_panels(panda), *([torque] if torque else [])],
+            "logarithmic": figure6.logarithmic(panda),
+            "stated": stated_table(panda.stated),
+        }
     return {
         "headline": words.headline(atlas, panda),
         "tiles": shown,
         "columns": max(len(shown), 1),
         "left_out": reasons,
         "atlas": None if atlas is None else _atlas(atlas),
-        "panda": None if panda is None else _panda(panda),
+        "panda": learned,
         "beyond": beyond(atlas, panda),
         "sets": list(figures.SET_NAMES.items()),
         "written": written,
@@ -149,17 +159,6 @@ def _not_judged(atlas: AtlasResults) -> str:
         f"{which} no box: eq. 20 is judged only where |τ| > {least} (our choice, since relative "
         "errors of less say nothing), which is never exceeded there."
     )
-
-
-def _panda(panda: PandaResults) -> dict[str, Any]:
-    torque = figure6.torque_panel(panda)
-    return {
-        "joints": [(j % JOINT_COLORS + 1, name) for j, name in enumerate(panda.tree.joint_names)],
-        "lambda": figure6.lambda_panels(panda),
-        "theta": [*figure6.theta_panels(panda), *([torque] if torque else [])],
-        "logarithmic": figure6.logarithmic(panda),
-        "stated": stated_table(panda.stated),
-    }
 
 
 def _atlas_reasons(atlas: AtlasResults) -> list[str]:
