@@ -98,8 +98,8 @@ class ServoGap:
             the fit has not seen: recordings held out, or the last third.
         scored: which data these are, in words.
         scale_open: joints (from 1) whose documented masses do not show the gains' scale.
-        ground: what the hand came down on, if anything; touched: for how long, s, in each recording
-            that is fitted.
+        ground: what the hand came down on beside what is documented, if anything; touched: for how
+            long, s, in each recording that is fitted.
         notes: a sentence each.
     """
 
@@ -192,9 +192,9 @@ def explain(
         servos = _servos(arm, fits)
     down = [over_ground(arm.rigid, arm.ground, track.smooth[0])[1] < 0.0 for track in tracks]
     touched = tuple(float(x.sum() * t.step_s) for x, t in zip(down, tracks, strict=True))
-    known = arm.ground is documented.ground or sum(x > TOUCHED_S for x in touched) >= LEAST_TOUCHED
-    if not known:  # where it lies in other poses, one motion does not tell
-        servos = replace(servos, ground=NO_GROUND)
+    ground = NO_GROUND if arm.ground is documented.ground else arm.ground
+    if ground.root > 0.0 and sum(x > TOUCHED_S for x in touched) < LEAST_TOUCHED:
+        servos = replace(servos, ground=NO_GROUND)  # one motion does not tell it in other poses
     progress("foretelling what was held out")
     before, after, scored = _scored(arm, fits, servos, unseen)
     found = _Table(arm)
@@ -213,7 +213,7 @@ def explain(
         after=after,
         scored=scored,
         scale_open=tuple(found.scale_open),
-        ground=arm.ground,
+        ground=ground,
         touched=touched,
         notes=(*(w for log in logs for w in log.warnings), *found.notes),
     )

@@ -19,7 +19,7 @@ LABEL = 30  # columns of a figure's name
 def headline(gap: ServoGap) -> str:
     """The outcome in one sentence."""
     before, after = (f"{plain(1e3 * float(x.max()), 2)} mrad" for x in (gap.before, gap.after))
-    if not gap.findings:
+    if not gap.findings and gap.ground.root == 0.0:
         return f"the arm does what its servos' documentation says: tracking as foretold to {before}"
     parts = [_short(finding) for finding in gap.findings]
     if gap.ground.root > 0.0:
