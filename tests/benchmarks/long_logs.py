@@ -14,6 +14,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def commands(log: Path, every: list[int], folder: Path, gap: bool) -> dict[str, 
 def main() -> None:
     """Measure what the command line names."""
     about = __doc__.splitlines()[0]
-    parser = options(about, seed=SEED, folder=Path("/tmp/w/long_logs"))
+    parser = options(about, seed=SEED, folder=Path(tempfile.gettempdir()) / "long_logs")
     parser.add_argument("--seconds", type=int, nargs="+", default=[60, 300, 600])
     parser.add_argument("--every", type=int, nargs="*", default=[1, 50])
     parser.add_argument("--gap", action="store_true", help="measure gap too")
