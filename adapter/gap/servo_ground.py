@@ -107,8 +107,8 @@ class _Together:
             stiff = (z[4] * SIZE[4] - 0.5 * np.log(STIFF)) / np.log(YIELDS)
             return np.concatenate([*rows, held * where, [held * stiff]])
 
-        def slopes(z: Array) -> Array:
-            here, servos = left(z), z[5:].reshape(x.shape) * scale
+        def slopes(z: Array, here: Array) -> Array:
+            servos = z[5:].reshape(x.shape) * scale
             out = np.zeros((len(here), len(z)))
             for k in range(5):
                 out[:, k] = (left(z + NUDGE * (np.arange(len(z)) == k)) - here) / NUDGE
@@ -144,7 +144,7 @@ class _Together:
 
 def robust_fit(
     left: Callable[[Array], Array],
-    slopes: Callable[[Array], Array],
+    slopes: Callable[[Array, Array], Array],
     z: Array,
     ends: Sequence[Array],
     rounds: int,
@@ -157,7 +157,7 @@ def robust_fit(
     rows, damping = left(z), 1e-3
     cost = misfit(rows / MILLI)
     for _ in range(rounds):
-        J, weight = slopes(z), 1.0 / np.sqrt(1.0 + (rows / MILLI / OUTLIER_RAD) ** 2)
+        J, weight = slopes(z, rows), 1.0 / np.sqrt(1.0 + (rows / MILLI / OUTLIER_RAD) ** 2)
         G, g = J.T @ (weight[:, None] * J), J.T @ (weight * rows)
         before = cost
         while damping < 1e6:

@@ -117,7 +117,11 @@ def between(at, t, table, out):
     for i in range(at.shape[0]):
         while k < last and t[k + 1] <= at[i]:
             k += 1
-        share = min(max((at[i] - t[k]) / (t[k + 1] - t[k]), 0.0), 1.0)
+        share = 0.0
+        if at[i] >= t[k + 1]:  # also where both are of one instant
+            share = 1.0
+        elif at[i] > t[k]:
+            share = (at[i] - t[k]) / (t[k + 1] - t[k])
         for j in range(table.shape[1]):
             out[i, j] = table[k, j] + share * (table[k + 1, j] - table[k, j])
 

@@ -210,15 +210,18 @@ def _with_joints(log: Log, spec: ImportSpec) -> Log:
     if not want:
         return log
     found, said = corresponding(want, have, "joint")
-    words = [[set(re.findall("[a-z]{3,}", name.casefold())) for name in x] for x in (want, have)]
-    shared = [[j for j, own in enumerate(words[1]) if own & other] for other in words[0]]
-    crossed = any(len(at) == 1 and at != [i] for i, at in enumerate(shared))  # words they share
-    if len(want) == len(have) and not any(found) and not crossed:
-        pairs = ", ".join(f"{a} = {b}" for a, b in zip(have, want, strict=True))
-        said = [
-            f"joint names differ and are matched by their order: {pairs} (else --names A=B,...)"
+    if len(want) == len(have) and not any(found):
+        words = [
+            [set(re.findall("[a-z]{3,}", x.casefold())) for x in each] for each in (want, have)
         ]
-        found = list(have)
+        shared = [[j for j, own in enumerate(words[1]) if own & other] for other in words[0]]
+        # words that names share may speak against the order
+        if not any(len(at) == 1 and at != [i] for i, at in enumerate(shared)):
+            pairs = ", ".join(f"{a} = {b}" for a, b in zip(have, want, strict=True))
+            said = [
+                f"joint names differ and are matched by their order: {pairs} (else --names A=B,...)"
+            ]
+            found = list(have)
     missing = [name for name, own in zip(want, found, strict=True) if own is None]
     if missing:
         raise DriverError(

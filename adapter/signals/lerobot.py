@@ -61,7 +61,11 @@ def write_lerobot(path: Path, folder: Path) -> list[str]:
         key: pa.FixedSizeListArray.from_arrays(pa.array(x.astype(np.float32).ravel()), n)
         for key, x in told.items()
     }
-    stats = {key: _stats(x.reshape(rows, -1)) for key, x in {**told, **single}.items()}
+    stats: dict[str, dict[str, list[Any]]] = {}
+    for key, x in {**told, **single}.items():
+        table = x.reshape(rows, -1)
+        stats[key] = {k: getattr(table, k)(axis=0).tolist() for k in ("min", "max", "mean", "std")}
+        stats[key]["count"] = [rows]
     episode = {"episode_index": 0, "tasks": _TASK["task"], "length": rows}
     episode |= {"dataset_from_index": 0, "dataset_to_index": rows}
     episode |= {f"{a}/{b}_index": 0 for a in ("data", "meta/episodes") for b in ("chunk", "file")}
@@ -92,12 +96,7 @@ def _signals(log: Log) -> tuple[dict[str, Array], list[str]]:
     commands, said = log.commands, list[str]()
     if commands is None or commands.q is None or not len(commands.q):
         return found, [f"{log.path}: has no commanded positions, and so the data set no action"]
-    at = np.searchsorted(commands.stamp_ns, log.stamp_ns, side="right") - 1
+    at = commands.holding(log.stamp_ns)
     if len(at) != len(commands.q) or np.any(log.stamp_ns != commands.stamp_ns):
         said.append(f"{log.path}: an action is the command that held at the sample; other are lost")
     return {**found, "action": commands.q[np.maximum(at, 0)]}, said
-
-
-def _stats(values: Array) -> dict[str, list[Any]]:
-    found = {key: getattr(values, key)(axis=0).tolist() for key in ("min", "max", "mean", "std")}
-    return {**found, "count": [len(values)]}

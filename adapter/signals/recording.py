@@ -218,7 +218,7 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
     tracking_error_rad = None
     if _of_servos(log):
         assert log.commands is not None and log.commands.q is not None
-        at = np.searchsorted(log.commands.stamp_ns, log.stamp_ns, side="right") - 1
+        at = log.commands.holding(log.stamp_ns)
         error = log.commands.q[at[at >= 0]] - log.q[at >= 0]  # a command holds until the next
         tracking_error_rad = np.sqrt(np.mean(error**2, axis=0)).tolist() if len(error) else []
         signals, judged = {"q_rad": q}, ["q"]

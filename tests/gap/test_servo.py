@@ -15,6 +15,7 @@ from adapter.errors import ModelError
 from adapter.gap.servo import explain
 from adapter.gap.servo_kernels import Ground, Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
+from adapter.gap.servo_signals import columns
 from adapter.gap.servo_words import headline
 from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import Log, read_position_log, write_log
@@ -113,6 +114,16 @@ def test_one_joint_steps_as_a_linear_servo_does() -> None:
     t, fast = step * np.arange(1, m + 1), omega * np.sqrt(1.0 - zeta**2)
     swing = np.cos(fast * t) + zeta * omega / fast * np.sin(fast * t)
     assert np.abs(q - (1.0 - np.exp(-zeta * omega * t) * swing)).max() < 1e-4
+
+
+def test_a_table_is_read_between_its_rows() -> None:
+    """As numpy has it: beyond the ends, and where two rows are of one instant."""
+    rng = np.random.default_rng(26)
+    for t in (np.cumsum(rng.uniform(0.1, 1.0, 20)), np.array([0.0, 0.0, 1.0, 2.0, 2.0])):
+        table, at = rng.standard_normal((len(t), 2)), np.sort(rng.uniform(-1.0, 12.0, 300))
+        at = np.union1d(at, t)
+        right = np.column_stack([np.interp(at, t, column) for column in table.T])
+        assert np.abs(columns(at, t, table) - right).max() < 1e-12
 
 
 def test_friction_holds_a_joint() -> None:

@@ -69,6 +69,10 @@ class Commands:
         q = None if self.q is None else copied(self.q, *rows)
         return Commands(copied(self.stamp_ns, *rows), copied(self.tau, *rows), q)
 
+    def holding(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(m,) number of the command that holds at each stamp; -1 before the first one."""
+        return np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
+
 
 @dataclass(frozen=True)
 class Log:
