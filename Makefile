@@ -22,7 +22,8 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench licences clean
 
 run: $(WARM)
-	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda --overwrite
+	$(BIN)/adapter run --scenario as_built --seed 5 --duration 40 --feedforward learned --out runs/panda --overwrite
+	$(BIN)/adapter gap runs/panda/recording.mcap --model panda --out runs/panda/gap
 
 experiment: $(WARM)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json

@@ -38,6 +38,7 @@ SCENARIOS = {
     "payload_at_20s": ScenarioKind(("mass", "t_s")),
     "friction": ScenarioKind(),
     "real_drives": ScenarioKind(),
+    "as_built": ScenarioKind(("mass", "t_s", "error")),
     "wall_mounted": ScenarioKind(),
 }
 

@@ -17,7 +17,16 @@ from sim.noise_levels import NoiseLevels
 from sim.options import ROBOTS, SCENARIOS, check
 from sim.plant import Plant
 from sim.sensors import Imus
-from sim.truth import FLANGE_M, Truth, direction, documented, facts_of, turn, turn_about
+from sim.truth import (
+    FLANGE_M,
+    Truth,
+    direction,
+    documented,
+    facts_of,
+    turn,
+    turn_about,
+    wrong_bodies,
+)
 
 FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
@@ -107,21 +116,40 @@ def friction(rng: np.random.Generator, robot: str) -> Truth:
     )
 
 
-def real_drives(rng: np.random.Generator, robot: str) -> Truth:
+def real_drives(rng: np.random.Generator, robot: str, spread: float = 0.0) -> Truth:
     """The same arm with friction that sticks, and the inertia of its motors.
 
     Without the one it creeps where a force controller holds it at rest by its noisy sensors, and
-    without the other its light wrist cannot be controlled.
+    without the other its light wrist cannot be controlled. Each level of friction is the published
+    one times `exp(spread)` or less, down to `exp(-spread)` of it.
     """
     facts = facts_of(robot)
     losses = facts["friction"]
-    effects = per_joint("viscous_friction", "Fv", losses["Fv"])
+    viscous, sticking = (
+        losses[key] * np.exp(rng.uniform(-spread, spread, len(losses[key]))) for key in ("Fv", "Fc")
+    )
+    effects = per_joint("viscous_friction", "Fv", viscous)
     effects += per_joint("motor_inertia", "B", facts["motors"]["B"])
     effects += tuple(
         Effect("bristle_friction", (j,), {"Fc": level, "s0": losses["s0"]})
-        for j, level in enumerate(losses["Fc"], 1)
+        for j, level in enumerate(sticking.tolist(), 1)
     )
     return documented(robot).with_changes(effects=effects)
+
+
+def as_built(
+    rng: np.random.Generator, robot: str, mass: float = 1.0, t_s: float = 25.0, error: float = 0.05
+) -> Truth:
+    """A unit that differs from its documentation as real ones do, and takes a ball half way.
+
+    Every inertial number is off by `error` of itself (rms), friction by up to half from what is
+    published for another unit, and the torque sensor of a large joint has its zero up to 1 N m off.
+    """
+    arm = real_drives(rng, robot, spread=np.log(1.5))
+    zero = per_joint("torque_offset", "o", rng.uniform(0.3, 1.0) * np.eye(arm.n)[rng.integers(4)])
+    (ball,) = payload_at_20s(rng, robot, mass, t_s).effects
+    bodies = wrong_bodies(arm.theta, error, rng)
+    return arm.with_changes(theta=bodies, effects=(*arm.effects, *zero, ball))
 
 
 def wall_mounted(rng: np.random.Generator, robot: str) -> Truth:
@@ -132,13 +160,14 @@ def wall_mounted(rng: np.random.Generator, robot: str) -> Truth:
 
 # The levels are those of a log in motion, where gears add to the noise. Chosen: with all of it at
 # rest a force controller, which takes its zero there, drifts away against friction.
-LEVELS = {"real_drives": {"tau_at_rest": 0.2}}
+LEVELS = {name: {"tau_at_rest": 0.2} for name in ("real_drives", "as_built")}
 DRAWN_BY: dict[str, Callable[..., Truth]] = {
     "nominal": nominal,
     "bent_link": bent_link,
     "payload_at_20s": payload_at_20s,
     "friction": friction,
     "real_drives": real_drives,
+    "as_built": as_built,
     "wall_mounted": wall_mounted,
 }
 

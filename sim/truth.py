@@ -18,6 +18,7 @@ FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ro
 FLANGE = np.eye(4)  # in the last link's frame
 FLANGE[2, 3] = FLANGE_M
 BETA_IS_ZERO = 1e-9  # below it (in sin β) only α + γ exists
+ATTEMPTS = 1000  # to draw what is possible
 
 
 class Slowing(NamedTuple):
@@ -191,6 +192,29 @@ def theta_of(m: float, com: list[float], inertia: list[float]) -> Array:
     c = np.array(com)
     shift = m * (c @ c * np.eye(3) - np.outer(c, c))
     return np.array([m, *(m * c), *(np.array(inertia) + shift[np.triu_indices(3)])])
+
+
+def wrong_bodies(theta: Array, error: float, rng: np.random.Generator) -> Array:
+    """θ (n, 10) with each number changed by `error` rms, every body still possible."""
+    wrong = [wrong_body(body, error, rng) for body in theta]
+    for j, body in enumerate(wrong):
+        assert body is not None, f"no possible body near that of link {j + 1}"
+    return np.array(wrong)
+
+
+def wrong_body(body: Array, error: float, rng: np.random.Generator) -> Array | None:
+    """(10,) with each number changed by `error` rms; None where none of those drawn is possible."""
+    for _ in range(ATTEMPTS):
+        wrong = np.asarray(body * (1 + error * rng.standard_normal(10)))
+        if possible(wrong):
+            return wrong
+    return None
+
+
+def possible(theta: Array) -> bool:
+    """Whether moments about the centre are those of some distribution of mass."""
+    moments = np.linalg.eigvalsh(body_of(theta)[2])
+    return bool(moments[0] > 0 and moments[0] + moments[1] > moments[2])
 
 
 def turn(axis: int, angle: float) -> Array:

@@ -30,8 +30,9 @@ RUN_WORDS = {
     "--excitation": "motion: random (default), or designed to teach most in the time",
     "--duration": "default 30; where the arm moves slowly at first (excitation.slow_s), behind "
     "that",
-    "--scenario": "of the simulated arm: nominal, bent_link, payload_at_20s, friction, "
-    "real_drives, wall_mounted (whose mounting is to be told: --gravity 9.81 0 0)",
+    "--scenario": "of the simulated arm: nominal, as_built (as real ones differ), bent_link, "
+    "payload_at_20s, friction, real_drives, wall_mounted (whose mounting is to be told: "
+    "--gravity 9.81 0 0)",
     "--set": "option of the scenario, as in --set mass=0.3 --set noise=none",
     "--feedforward": "model that helps the controller (default none; for a designed motion "
     "documented); its worth is told as tracking error",

@@ -23,7 +23,8 @@ def warm_up() -> int:
     """
     with tempfile.TemporaryDirectory() as name:
         common = ["--quiet", "--no-report", "--out"]
-        live = ["run", "--scenario", "friction", "--duration", "3", "--no-record"]
+        live = ["run", "--scenario", "as_built", "--set", "t_s=2", "--feedforward", "learned"]
+        live += ["--duration", "4", "--no-record"]
         search = ["gap", LOG, "--model", "panda", *common, f"{name}/gap"]
         again = ["replay", LOG, *common, f"{name}/again"]
         lanes = [[*live, *common, f"{name}/run"]], [search, again]

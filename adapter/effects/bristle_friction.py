@@ -97,7 +97,7 @@ class BristleFriction(LearnedEffect, Rubs):
     form = LEVEL
     bundled = True
     simpler = ((LEVEL, 0.01),)  # Coulomb friction, which is the same where s0 is small
-    phrase = Phrase("{who} {lacks} {Fc} of bristle friction, which winds up over {s0}")
+    phrase = Phrase("{who} {lacks} {Fc} of bristle friction, which winds up over {s0}", "Fc")
     shows = ((STILL, "fades or changes sign"), (TURNS, "turns over gradually"))
 
     def templates(self) -> tuple[Template, ...]:

@@ -49,7 +49,7 @@ def headline_parts(result: GapResult) -> list[str]:
     if not result.findings and not result.unexplained:
         said = [_nothing(result), *result.contradictions, stopped(result)]
         return [part for part in said if part]
-    parts = _finding_parts(result.findings)
+    parts = finding_parts(result.findings)
     if result.findings:
         parts += [_shrink(result), worse(result)]
     parts += [_left(result.unexplained), *result.contradictions, stopped(result)]
@@ -196,7 +196,7 @@ def _nothing(result: GapResult) -> str:
     return f"{said} down to its noise"
 
 
-def _finding_parts(findings: Sequence[Finding]) -> list[str]:
+def finding_parts(findings: Sequence[Finding]) -> list[str]:
     """Findings in words, those of the same kind in one; the largest first where there are many."""
     groups = by_kind(findings)
     if len(groups) > MOST_PARTS:
@@ -244,13 +244,17 @@ def _in_recordings(findings: Sequence[Finding]) -> str:
 
 
 def _values(findings: Sequence[Finding]) -> str:
-    """Main parameters of findings of one kind, in brackets."""
+    """Main parameters of findings of one kind, in brackets; of more than three their range."""
     key = phrase_of(findings[0]).key
     values = [float(f.parameters[key]) for f in findings if f.parameters.get(key) is not None]
     if len(values) < len(findings):
         return ""
     factor, unit = shown_unit(max(values, key=abs), findings[0].units.get(key, ""))
-    return f" ({listed([plain(factor * value, 2) for value in values])} {unit})"
+    shown = [plain(factor * value, 2) for value in (values if len(values) < 4 else sorted(values))]
+    if len(shown) < 4:
+        return f" ({listed(shown)} {unit})"
+    low, high = shown[0], shown[-1]
+    return f" ({low if float(low) == float(high) else f'{low} to {high}'} {unit})"
 
 
 def _shrink(result: GapResult) -> str:

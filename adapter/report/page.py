@@ -16,7 +16,7 @@ from adapter.report.next_steps import next_steps
 from adapter.report.skeleton import has_reference, skeleton_panels
 from adapter.report.style import ACCENT, JOINT_COLORS, Drawing, Panel, time_axis
 from adapter.report.trust import against, checks, headline
-from adapter.report.worth import Worth, worth_panels, worth_table
+from adapter.report.worth import Worth, truth_tables, worth_panels, worth_table
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL
 
@@ -79,6 +79,7 @@ def context(data: RunData) -> dict[str, Any]:
         "joint_tables": tables.joint_tables(data),
         "matrices": [tables.schema_matrix(data), tables.theta_matrix(data)],
         "changes": tables.changes_table(data),
+        "truths": truth_tables(data),
         "refused": tables.refused_table(figures),
         "gaps": len(figures.get("gaps") or []),
         "warnings": [*ended, *new, *map(str, figures.get("warnings") or [])],

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.active import active_effects
+from adapter.effects.active import Active, active_effects
 from adapter.effects.base import ALL
 from adapter.gap.phrases import SHOWN_UNITS
 from adapter.judgement.priors import is_shown
@@ -94,8 +94,9 @@ def joint_tables(data: RunData) -> list[Table]:
         columns.append(("Not explained", "N m rms", _column(theta["torque_rmse_nm"])))
     if theta.get("validation_torque_rmse_nm"):
         columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
-    effects = _effect_columns(data)
-    return [by_column(columns), *([by_column([names, *effects])] if effects else [])]
+    effects = effect_columns(active_effects(data.model.effects, data.n), data.n)
+    more = [(head, unit, cells) for (head, unit), cells in effects.items()]
+    return [by_column(columns), *([by_column([names, *more])] if more else [])]
 
 
 def by_column(columns: Sequence[tuple[str, str, list[str]]]) -> Table:
@@ -113,29 +114,33 @@ def _column(values: Sequence[Any], scale: float = 1.0) -> list[str]:
     return out
 
 
-def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
-    """The effects of the model file: value ± standard deviation by joint.
+def effect_columns(
+    effects: Iterable[Active], n: int, fitted: Collection[tuple[str, str]] | None = None
+) -> dict[tuple[str, str], list[str]]:
+    """Cells (n,) of each (head, unit): value ± standard deviation of effects by joint.
 
-    One of all joints stands at each of them; one of the flange at none.
+    One of all joints stands at each of them; one of the flange at none. Of `fitted` (effect, key)
+    alone, where they are given.
     """
     columns: dict[tuple[str, str], list[str]] = {}
-    for active in active_effects(data.model.effects, data.n):
+    for active in effects:
         effect = active.effect
-        joints = range(data.n) if effect.scope == ALL and active.joint < 0 else [active.joint]
+        joints = range(n) if effect.scope == ALL and active.joint < 0 else [active.joint]
         for key, value in active.values.items():
-            if np.ndim(value) or joints[0] < 0:
+            left_out = fitted is not None and (effect.name, key) not in fitted
+            if np.ndim(value) or joints[0] < 0 or left_out:
                 continue
             given = effect.units()[key]
             factor, unit = SHOWN_UNITS.get(given, (1.0, given))
             head = effect.name.replace("_", " ").capitalize()
-            column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * data.n)
+            column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * n)
             std = active.std.get(key)
             shown = "not shown"
             if is_shown(effect.name, key, std):
                 shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown
-    return [(head, unit, cells) for (head, unit), cells in columns.items()]
+    return columns
 
 
 def schema_matrix(data: RunData) -> Matrix:
@@ -202,21 +207,27 @@ def refused_table(figures: Mapping[str, Any]) -> Table | None:
     return Table(["Reason", "Samples", "Meaning"], rows)
 
 
+CHANGE_HEADS = ("Seen at", "Load", "Centre of mass")
+CHANGE_UNITS = ("s after the first motion", "kg", "mm, in the last link's frame")
+
+
+def change_rows(data: RunData) -> list[list[str]]:
+    """Changes at the hand with what they brought, under `CHANGE_HEADS`."""
+    changes = data.figures["theta"].get("changes") or []
+    return [load_cells(x["stamp_s"] - data.start_s, x.get("payload") or {}) for x in changes]
+
+
 def changes_table(data: RunData) -> Table | None:
-    """Changes at the hand with what they brought; None where there were none."""
-    rows = []
-    for change in data.figures["theta"].get("changes") or []:
-        load = change.get("payload") or {}
-        centre = [load.get(key) for key in ("cx", "cy", "cz")]
-        rows.append(
-            [
-                number(change["stamp_s"] - data.start_s, 4),
-                with_doubt(load["m"], load.get("m_std")) if load else DASH,
-                ", ".join(number(1e3 * x) for x in centre if x is not None) or DASH,
-            ]
-        )
-    units = ["s after the first motion", "kg", "mm, in the last link's frame"]
-    return Table(["Seen at", "Load", "Centre of mass"], rows, units) if rows else None
+    """These; None where there were none."""
+    rows = change_rows(data)
+    return Table(CHANGE_HEADS, rows, CHANGE_UNITS) if rows else None
+
+
+def load_cells(at_s: float, load: Mapping[str, Any]) -> list[str]:
+    """Since when, how heavy, where its centre is."""
+    centre = [number(1e3 * load[key]) for key in ("cx", "cy", "cz") if load.get(key) is not None]
+    mass = with_doubt(load["m"], load.get("m_std")) if load else DASH
+    return [number(at_s, 4), mass, ", ".join(centre) or DASH]
 
 
 def theta_table(data: RunData) -> Table:

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from adapter.gap.phrases import numbered
+from adapter.gap.words import finding_parts
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
+from adapter.report.gap_tables import tied
 from adapter.report.learned_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
@@ -23,6 +25,7 @@ from adapter.report.words import (
     capital,
     count,
     is_live,
+    is_simulated,
     missed_words,
     not_learned,
     number,
@@ -45,15 +48,26 @@ def headline(data: RunData, worth: Worth) -> list[str]:
     if why := refusal(data.figures):
         found = [f"Nothing was learned, since the torques are not those of this arm: {why}"]
     else:
-        found = [*_tracking(worth), *_torque(data, worth), *_loads(data, worth)]
+        found = [*_lacks(worth), *_torque(data, worth), *_tracking(worth), *_loads(data, worth)]
         found += _hand(data, worth)
-    late = [f"{capital(missed_words(data.figures))}."] if is_live(data.figures) else []
+    real = is_live(data.figures) and not is_simulated(data.figures)  # a simulated arm waits
+    late = [f"{capital(missed_words(data.figures))}."] if real else []
     return [*found, *_trouble(data.figures), *late]
 
 
 def against(figures: Mapping[str, Any]) -> str:
     """What errors of λ are against: "documentation", or the name of the file that was given."""
     return Path(str(figures["lambda"].get("reference") or DOCUMENTATION)).name
+
+
+def _lacks(worth: Worth) -> list[str]:
+    """What the documentation has otherwise, the most first; nothing where it has all of it."""
+    parts, bodies, fall = finding_parts(worth.lacks), worth.bodies_nm, worth.torque
+    if fall is not None and bodies is not None and (bodies > fall.after).any():
+        j = int(np.argmax(bodies))
+        size = quantity(bodies[j], "N m", 2)
+        parts.insert(0, f"links weigh otherwise, by up to {size} of torque (joint {j + 1})")
+    return [f"This arm is not as documented: {'; '.join(map(tied, parts))}."] if parts else []
 
 
 def _tracking(worth: Worth) -> list[str]:
@@ -316,10 +330,11 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
     if plant.get("p50") is not None:
         said += (
             f", beside it the physics of the simulated arm {quantity(plant['p50'], 'µs')}, p99 "
-            f"{quantity(plant.get('p99'), 'µs')}"
+            f"{quantity(plant.get('p99'), 'µs')}, which waits where it is late: nothing is lost"
         )
     share = missed / deadlines
-    verdict = GOOD if share < FEW_MISSED else LOOK if share < MANY_MISSED else BAD
+    bad = share >= MANY_MISSED and not is_simulated(figures)
+    verdict = GOOD if share < FEW_MISSED else BAD if bad else LOOK
     return Check(verdict, "Timing", said)
 
 

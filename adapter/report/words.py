@@ -77,6 +77,11 @@ def is_live(figures: Mapping[str, Any]) -> bool:
     return bool(figures.get("timing") or figures.get("lateness_us"))
 
 
+def is_simulated(figures: Mapping[str, Any]) -> bool:
+    """Whether the arm was simulated in the process itself, and waited for whoever was late."""
+    return ((figures.get("timing") or {}).get("plant_us") or {}).get("p50") is not None
+
+
 def missed_words(figures: Mapping[str, Any]) -> str:
     """How many deadlines were missed, by our own work and by the machine's."""
     missed = figures.get("missed_deadlines") or 0
@@ -88,8 +93,7 @@ def missed_words(figures: Mapping[str, Any]) -> str:
     own = timing.get("missed_own")
     if own is None:
         return said
-    simulated = (timing.get("plant_us") or {}).get("p50") is not None
-    work = "our own work" + (" and the arm's simulation" if simulated else "")
+    work = "our own work" + (" and the arm's simulation" if is_simulated(figures) else "")
     return (
         f"{said}: {count(own)} because {work} took too long, {count(missed - own)} because the "
         "machine ran something else"

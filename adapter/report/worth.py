@@ -1,28 +1,40 @@
-"""What the learned model is worth: torque and tracking errors before and after, the load found.
+"""What was found and what it is worth: torque and tracking errors before and after, loads.
 
-As numbers, as a table joint by joint, and as panels.
+As numbers, as tables joint by joint, and as panels; a simulated arm's truth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.active import active_effects
+from adapter.effects.catalogue import KNOWN
 from adapter.effects.torque import ModelTorque
+from adapter.gap.result import Finding
 from adapter.model.numbers import DASH
-from adapter.model.self_model import LAMBDA_MEASURED
+from adapter.model.self_model import LAMBDA_MEASURED, SelfModel
 from adapter.model.spatial import Array
 from adapter.report.gap_panels import fall_drawing
 from adapter.report.learned_panels import change_times, theta_started
 from adapter.report.skeleton import placed_arm, some_postures
 from adapter.report.style import Panel
-from adapter.report.tables import Table, by_column
-from adapter.report.words import number, with_doubt
+from adapter.report.tables import (
+    CHANGE_HEADS,
+    CHANGE_UNITS,
+    Table,
+    by_column,
+    change_rows,
+    effect_columns,
+    load_cells,
+)
+from adapter.report.words import capital, number, with_doubt
 from adapter.runs.run_folder import RunData
+from adapter.runs.score import stamps_s
 from adapter.signals.validation import rms_of
 
 FEWEST_ROWS = 50
@@ -153,13 +165,20 @@ def hand_off_m(data: RunData) -> float | None:
 class Worth:
     """What a run brought: errors before and after, how far off the hand stood, the loads found.
 
-    `loads`: (when, s after the first motion, kg, its standard deviation).
+    Attributes:
+        loads: (when, s after the first motion, kg, its standard deviation).
+        lacks: effects that were learned surely and that add more to their joint's torque than
+            the learned model leaves there.
+        bodies_nm: (n,) rms of what the links' other inertias, loads left out, change of the
+            torques; None where nobody knows.
     """
 
     torque: Fall | None
     tracking: Fall | None
     hand_m: float | None
     loads: list[tuple[float, float, float | None]]
+    lacks: list[Finding] = field(default_factory=list)
+    bodies_nm: Array | None = None
 
     @classmethod
     def of(cls, data: RunData) -> Worth:
@@ -169,7 +188,97 @@ class Worth:
         changes = [change.get("payload") for change in data.figures["theta"].get("changes") or []]
         pairs = zip(change_times(data), changes, strict=True)
         loads = [(at_s, load["m"], load.get("m_std")) for at_s, load in pairs if load]
-        return cls(torque_fall(data), tracking_fall(data.figures), hand_m, loads)
+        fall = torque_fall(data)
+        worth = cls(fall, tracking_fall(data.figures), hand_m, loads)
+        known = fall is not None and fall.before is not None
+        if fall is None or not known or not data.figures["theta"].get("settled", True):
+            return worth
+        held = [load for load in (data.figures["theta"].get("held"), *changes[-1:]) if load]
+        return replace(worth, lacks=_lacks(data, fall), bodies_nm=_bodies(data, held))
+
+
+def _torque(data: RunData, model: SelfModel, own_log: bool = False) -> Array:
+    """(k, n) N m of a model on the motion that the learned one is judged on."""
+    rows = fit_rows(data)
+    q, dq, ddq = (x[rows] for x in data.score_signals()[:3])
+    t = stamps_s(data.score_trace)[rows]
+    return ModelTorque(model, own_log=own_log)(q, dq, ddq, t)
+
+
+def _lacks(data: RunData, fall: Fall) -> list[Finding]:
+    """As `Worth` has them, each kind weighed by itself on the documented arm."""
+    n, there, found = data.n, data.documented.effects, []
+    documented = {entry["effect"] for entry in there}
+    first, names = _torque(data, data.documented), {e["effect"] for e in data.model.effects}
+    for name in sorted(names - documented):
+        own = tuple(entry for entry in data.model.effects if entry["effect"] == name)
+        size = _torque(data, replace(data.documented, effects=(*there, *own))) - first
+        rms, effect = rms_of([size]).value, KNOWN[name]
+        found += [
+            Finding(
+                effect=name,
+                title=effect.title,
+                joints=(x.joint + 1,),
+                interval_s=(0.0, np.inf),
+                lasting=True,
+                parameters=dict(x.values),
+                std=dict(x.std),
+                units=effect.units(),
+                evidence=np.nan,
+                overlaps={},
+                split_by="",
+                detectability=np.nan,
+                torque_rms_nm=np.where(np.arange(n) == x.joint, rms, 0.0),
+            )
+            for x in active_effects(own, n)
+            if x.joint >= 0 and x.shown and rms[x.joint] > fall.after[x.joint]
+        ]
+    return found
+
+
+def _bodies(data: RunData, held: list[Mapping[str, Any]]) -> Array:
+    """(n,) N m rms of what links change that weigh otherwise than documented, beside loads."""
+    loads = tuple(
+        {"effect": "payload", "parameters": {key: load[key] for key in ("m", "cx", "cy", "cz")}}
+        for load in held
+    )
+    before = replace(data.documented, effects=(*data.documented.effects, *loads))
+    after = replace(data.documented, theta=data.model.theta)
+    return rms_of([_torque(data, after) - _torque(data, before)]).value
+
+
+def truth_tables(data: RunData) -> list[Table]:
+    """What is true of a simulated arm beside what was learned, joint by joint; none of another."""
+    truth = data.figures.get("truth")
+    if truth is None or data.documented.tree.floating:
+        return []
+    n, names = data.n, ("Joint", "", list(data.documented.tree.joint_names))
+    entries = [entry for entry in truth["effects"] if entry["effect"] in KNOWN]
+    theta = np.array(data.documented.theta)
+    theta[-n:] = truth["theta"]
+    lam, gravity = np.array(truth["lambda"]), np.array(truth["gravity"])
+    arm = replace(data.documented, lam=lam, theta=theta, gravity=gravity, effects=tuple(entries))
+    true = _torque(data, arm, own_log=True)
+    torque: list[tuple[str, str, list[str]]] = [
+        (f"{capital(name)} model off by", "N m rms", [number(x, 2) for x in rms_of([off]).value])
+        for name, off in (
+            ("documented", _torque(data, data.documented) - true),
+            ("learned", _torque(data, data.model) - true),
+        )
+    ]
+    fitted = {(e["effect"], key) for e in data.model.effects for key in e.get("std") or ()}
+    told = effect_columns(active_effects(data.model.effects, n), n, fitted)
+    columns = []
+    for (head, unit), cells in effect_columns(active_effects(entries, n), n, fitted).items():
+        columns += [(head, unit, told.get((head, unit), [DASH] * n)), ("in truth", unit, cells)]
+    tables = [by_column([names, *torque]), *([by_column([names, *columns])] if columns else [])]
+    loads = [
+        ["in truth", *load_cells((e["interval_s"] or [0.0])[0] - data.start_s, e["parameters"])]
+        for e in entries
+        if e["effect"] == "payload"
+    ]
+    rows = [*(["learned", *row] for row in change_rows(data)), *loads]
+    return [*tables, *([Table(["", *CHANGE_HEADS], rows, ["", *CHANGE_UNITS])] if rows else [])]
 
 
 def worth_table(data: RunData, worth: Worth) -> Table | None:

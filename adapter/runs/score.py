@@ -43,11 +43,13 @@ class Reference:
     Attributes:
         lam: (n, 6); theta: (n, 10), None where not known.
         source: "documentation", or the file it was read from.
+        truth: what a scenario's file tells, for the page; None of anything else.
     """
 
     lam: Array
     theta: Array | None
     source: str
+    truth: Mapping[str, Any] | None = None
 
 
 def reference_from(path: str | Path | None, documented: SelfModel) -> Reference:
@@ -65,15 +67,18 @@ def reference_from(path: str | Path | None, documented: SelfModel) -> Reference:
         raise ModelError(f"{path}: cannot be read as a truth or model file: {error}") from error
     if not isinstance(content, dict) or "lambda" not in content:
         raise ModelError(f"{path}: has no 'lambda'; give a scenario's truth or a model file")
+    truth: Mapping[str, Any] | None = None
     if content.get("format") == "panda-adapter/self-model":
         model = load_model(path)
         lam, theta = model.lam, model.theta[-n:]
     else:
         lam = np.array(content["lambda"], dtype=float)
         theta = np.array(content.get("theta", []), dtype=float)
+        whole = content.keys() >= {"theta", "effects", "gravity"}
+        truth = content if whole and content.get("format") == "panda-adapter/truth" else None
     if lam.shape != (n, 6):
         raise ModelError(f"{path}: describes {len(lam)} joints, the robot has {n}")
-    return Reference(lam, theta if theta.shape == (n, 10) else None, str(path))
+    return Reference(lam, theta if theta.shape == (n, 10) else None, str(path), truth)
 
 
 def stamps_s(rows: Array) -> Array:
@@ -307,5 +312,6 @@ def figures(
         "theta": theta_score(outcome, documented, start_s),
         "torques": {"judged": outcome.verdict.judged, "refusal": outcome.verdict.refusal},
         "disagreements": None if outcome.disagreements is None else list(outcome.disagreements),
+        **({} if reference.truth is None else {"truth": dict(reference.truth)}),
         **more,
     }

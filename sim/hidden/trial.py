@@ -33,7 +33,7 @@ from sim.hidden.sizes import (
 )
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
-from sim.truth import Array, Truth, body_of, panda
+from sim.truth import ATTEMPTS, Array, Truth, panda, wrong_bodies
 from sim.urdf_writer import urdf
 
 FORMAT, VERSION = "panda-adapter/hidden-truth", 1
@@ -44,7 +44,6 @@ FRICTION_SHARE = 0.4  # of the trials have friction in every joint beside what i
 DISTURBANCE_NM = (0.02, 0.08)  # rms; less on joints 5 to 7
 DISTURBANCE_HZ = (0.3, 3.0)  # corner of the low-pass that colours it
 TRIAL_STREAM, DISTURBANCE_STREAM = 34, 35  # apart from the streams of the noise
-ATTEMPTS = 1000
 # Of two friction laws on one joint, or of two of these, only the sum can be seen.
 FRICTION = {
     "coulomb_friction",
@@ -227,29 +226,6 @@ def _apart(first: Effect, second: Effect) -> bool:
     same_place = not first.joints or not second.joints or first.joints == second.joints
     alike = any(names <= group for group in LOOK_ALIKE)
     return not (alike and (same_place or "payload" in names))
-
-
-def wrong_bodies(theta: Array, error: float, rng: np.random.Generator) -> Array:
-    """θ (n, 10) with each number changed by `error` rms, every body still possible."""
-    wrong = [wrong_body(body, error, rng) for body in theta]
-    for j, body in enumerate(wrong):
-        assert body is not None, f"no possible body near that of link {j + 1}"
-    return np.array(wrong)
-
-
-def wrong_body(body: Array, error: float, rng: np.random.Generator) -> Array | None:
-    """(10,) with each number changed by `error` rms; None where none of those drawn is possible."""
-    for _ in range(ATTEMPTS):
-        wrong = np.asarray(body * (1 + error * rng.standard_normal(10)))
-        if possible(wrong):
-            return wrong
-    return None
-
-
-def possible(theta: Array) -> bool:
-    """Whether moments about the centre are those of some distribution of mass."""
-    moments = np.linalg.eigvalsh(body_of(theta)[2])
-    return bool(moments[0] > 0 and moments[0] + moments[1] > moments[2])
 
 
 def first_order(white: Array, keep: float) -> Array:

@@ -30,6 +30,7 @@ BRIEFLY = {
     "--duration 24": "--duration 3",  # nothing is picked up
     "--duration 10": "--duration 5",
     "--duration 12": "--duration 3",
+    "--duration 40": "--duration 3",
     "--duration 20": "--duration 12",
     "--validate-from 14": "--validate-from 6",
 }

@@ -18,9 +18,9 @@ from sim.hidden import Trial, draw, nominal_urdf
 from sim.hidden.motion import DrawnMotion, draw_motion
 from sim.hidden.record import log_of, write_files
 from sim.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
-from sim.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM, wrong_bodies
+from sim.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM
 from sim.noise_levels import NoiseLevels
-from sim.truth import panda
+from sim.truth import panda, wrong_bodies
 from tests.helpers.gap_effects import Array, sense
 
 NOISE_STREAM = 1 << 35

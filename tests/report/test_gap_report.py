@@ -56,8 +56,8 @@ SAID = {
     "problem": "joints 1 to 7 hardly move; move each over 0.5 rad and more than 0.2 rad/s.",
     "two_joints": "the torque of all joints comes 2.10 ± 0.10 ms after the position; "
     "torque error 0.90 -> 0.04 N m over all joints, 0.90 -> 0.03 of joint 1, the worst",
-    "many": "joints 1 to 7 lack Coulomb friction (0.27, 0.20, 0.14, 0.45, 0.30, 0.15 and "
-    "0.25 N m); joints 1, 2 and 4 lack viscous friction (0.10, 0.20 and 0.40 N m s/rad); "
+    "many": "joints 1 to 7 lack Coulomb friction (0.14 to 0.45 N m); "
+    "joints 1, 2 and 4 lack viscous friction (0.10, 0.20 and 0.40 N m s/rad); "
     "the torque sensor of joint 2 reads 0.310 ± 0.020 N m too little; 2 more findings; "
     "torque error 1.18 -> 0.52 N m over all joints, 0.77 -> 0.29 of joint 2, the worst; "
     "joints 3 and 6: 0.30 and 0.60 N m are not "

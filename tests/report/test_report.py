@@ -25,7 +25,7 @@ from adapter.report.learned_panels import bodies_over_time, rotation_path
 from adapter.report.next_steps import _again, next_steps
 from adapter.report.style import thin
 from adapter.report.trust import headline
-from adapter.report.worth import SLOW, Worth, slow_share, torque_fall
+from adapter.report.worth import SLOW, Worth, slow_share, torque_fall, truth_tables
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
 from adapter.runs.pipeline import Pipeline
@@ -200,7 +200,8 @@ def test_headline_says_what_changed_and_what_it_is_worth(data: RunData) -> None:
     heavy = replace(data, documented=worse)
     said = said_of(heavy)
     number = r"([\d.]+) ± [\d.]+ N m"
-    found = re.match(
+    assert said.startswith("This arm is not as documented: links weigh otherwise, by up to ")
+    found = re.search(
         rf"The torque error of all joints fell from {number} with the docu.* to {number}", said
     )
     q, dq, ddq, tau, error = data.score_signals()
@@ -209,6 +210,30 @@ def test_headline_says_what_changed_and_what_it_is_worth(data: RunData) -> None:
     for text, table in zip(found.groups(), (expected, error), strict=True):
         size = np.sqrt(np.mean(table[rows] ** 2, axis=0).sum())
         assert float(text) == pytest.approx(size, rel=0.05)
+
+
+def test_what_the_documentation_lacks_comes_first_and_the_truth_last(data: RunData) -> None:
+    """Sure effects that tell more than what is left, and no other; the truth as `sim` has it."""
+    entries = [
+        {"effect": "coulomb_friction", "joints": [j], "parameters": {"Fc": Fc}, "std": {"Fc": std}}
+        for j, Fc, std in ((2, 1e-3, 1e-4), (3, 0.5, 0.4), (4, 0.5, 0.01))
+    ]
+    world = build("as_built", 5)
+    truth = {"effect": "coulomb_friction", "joints": [4], "parameters": {"Fc": 0.5}}
+    told = with_figures(data, truth={**world.as_dict(), "effects": [truth]})
+    told = replace(told, model=replace(data.model, effects=tuple(entries)))
+    lacks = "This arm is not as documented: joint 4 lacks 0.500 ± 0.010 N m of Coulomb friction. "
+    assert said_of(told).startswith(lacks)
+    q, dq, ddq, _, _ = data.score_signals()
+    arm = RigidArm.of(data.documented)
+    true = [world.truth.torques(*row) for row in zip(q, dq, ddq, strict=True)]
+    off = arm.torque(q, dq, ddq) - true
+    off[:, 3] -= 0.5 * np.tanh(dq[:, 3] / 0.01)
+    torques, friction = truth_tables(told)
+    shown = [float(row[1]) for row in torques.rows]
+    np.testing.assert_allclose(shown, np.sqrt(np.mean(off**2, axis=0)), rtol=0.06, atol=2e-3)
+    assert friction.rows[3][1:] == ("0.500 ± 0.010", "0.500")
+    assert 'id="truth"' in render(told) and 'id="truth"' not in render(data)
 
 
 def test_headline_names_the_joint_that_changed_most(data: RunData) -> None:

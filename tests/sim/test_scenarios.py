@@ -158,6 +158,17 @@ def test_truth_file_says_what_the_arm_is(name, tmp_path):
         coulomb = [e for e in told["effects"] if e["effect"] == kind]
         assert [e["parameters"]["Fc"] for e in coulomb] == facts_of("panda")["friction"]["Fc"]
         assert [e["joints"] for e in coulomb] == [[j] for j in range(1, 8)]
+    elif name == "as_built":
+        (load,) = [e for e in told["effects"] if e["effect"] == "payload"]
+        (zero,) = [e["parameters"]["o"] for e in told["effects"] if e["effect"] == "torque_offset"]
+        assert (load["interval_s"], 0.3 <= zero <= 1.0) == ([25.0, None], True)
+        share = [
+            e["parameters"]["Fc"] for e in told["effects"] if e["effect"] == "bristle_friction"
+        ]
+        share = np.array(share) / facts_of("panda")["friction"]["Fc"]
+        assert (share > 0.66).all() and (share < 1.51).all() and np.ptp(share) > 0.1
+        off = truth.theta / panda().theta - 1.0
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(0.05, rel=0.3)
     else:
         assert not told["effects"]
 
