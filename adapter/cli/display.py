@@ -98,8 +98,9 @@ def _learning(now: Now) -> Text:
 
 def _progress(now: Now, known: KnownRun) -> Text:
     """Time, samples, timing."""
-    end = "" if known.duration_s is None else f" of {known.duration_s:g}"
-    text = Text(f"{now.t_s:.1f}{end} s", no_wrap=True, overflow="ellipsis")
+    last = known.duration_s
+    at_s, end = (now.t_s, "") if last is None else (min(now.t_s, last), f" of {last:g}")
+    text = Text(f"{at_s:.1f}{end} s", no_wrap=True, overflow="ellipsis")
     if now.view.snapshot is not None:
         text.append(f" · {now.view.snapshot.learned} learned, {now.view.waiting} wait")
     if now.lately is not None and now.view.timing is not None:

@@ -135,7 +135,7 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
         table.add_row("held-out torque", f"{values} N m")
     if tick.get("p50") is not None:
         table.add_row(
-            "tick",
+            "driver, filter, synthesis",
             f"p50 {tick['p50']:.0f} µs, p99 {tick['p99']:.0f} µs"
             + (f"; {missed_words(figures)}" if is_live(figures) else ""),
         )

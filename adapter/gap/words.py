@@ -24,6 +24,7 @@ from adapter.gap.result import WORSE, Finding, GapResult, Leftover, LogLoad
 from adapter.model.numbers import plain, plus_minus
 from adapter.model.spatial import Array
 
+SURE = 0.99  # evidence from which a finding is called well known
 MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
 WIDER = "move the joint faster, and over a wider range"  # what tells one curve from another
@@ -197,10 +198,11 @@ def _nothing(result: GapResult) -> str:
 
 
 def finding_parts(findings: Sequence[Finding]) -> list[str]:
-    """Findings in words, those of the same kind in one; the largest first where there are many."""
+    """Findings in words, those of the same kind in one; the surest first, of many the largest."""
     groups = by_kind(findings)
     if len(groups) > MOST_PARTS:
         groups.sort(key=lambda group: -max(_size(f) for f in group))
+    groups.sort(key=lambda group: min(f.evidence for f in group) < SURE)
     parts = [_group(group) for group in groups[:MOST_PARTS]]
     more = sum(len(group) for group in groups[MOST_PARTS:])
     return [*parts, f"{more} more finding{'' if more == 1 else 's'}"] if more else parts

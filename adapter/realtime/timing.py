@@ -113,17 +113,14 @@ class TimingReport:
     def lines(self) -> list[str]:
         """For people."""
         rows = {
-            "compute (driver, filter, synthesis)": self.tick_us,
-            "compute of the whole tick": self.loop_us,
+            "driver, filter, synthesis": self.tick_us,
+            "the whole tick": self.loop_us,
             "physics of the simulated arm": self.plant_us,
             "lateness": self.lateness_us,
             "period": self.period_us,
             "age of a sample when the loop has it": self.age_us,
         }
-        out = [
-            f"{self.ticks} ticks, {self.missed_deadlines} deadlines missed "
-            f"({self.missed_own} by our own work, the others taken by the machine)"
-        ]
+        out = []
         for name, values in rows.items():
             if values["p50"] is not None:
                 shown = "  ".join(f"{k} {v:.1f}" for k, v in values.items() if v is not None)

@@ -124,10 +124,11 @@ def _tiles(result: GapResult) -> list[Tile]:
         fell = f"{words.fall(first, last)} N m".replace("->", "→").replace(" ", NARROW)
         tiles.append(Tile("Torque error", fell, f"joint {worst + 1}, the worst; rms"))
     if worst is not None and noise[worst] > 0.0:
+        times = words.noise_times(result)
         tiles.append(
             Tile(
                 "In units of its noise",
-                _arrow(first / noise[worst], last / noise[worst], "×"),
+                _arrow(times[0][worst], times[1][worst], "×"),
                 tables.tied(f"joint {worst + 1}, noise {plain(noise[worst], 2)} N m"),
             )
         )
@@ -146,7 +147,6 @@ def _arrow(before: float, after: float, unit: str) -> str:
 
 # --- whether to trust what is named, and what to do next -----------------------------------------
 
-SURE = 0.99  # evidence from which a finding is called well known
 FIGURES = "gap.json"  # beside the page
 
 
@@ -166,7 +166,7 @@ def _evidence(result: GapResult) -> Check:
     least = min(result.findings, key=lambda f: f.evidence)
     called = f"{least.title}, {who(least.effect, least.joints)}"
     said = f"the least sure of {len(result.findings)}: {called}, {words.percent(least.evidence)}"
-    return Check(GOOD if least.evidence >= SURE else LOOK, "How sure", said)
+    return Check(GOOD if least.evidence >= words.SURE else LOOK, "How sure", said)
 
 
 def _rivals(result: GapResult) -> Check:

@@ -10,7 +10,16 @@ import numpy as np
 
 from adapter.gap.phrases import parameter_lines, shown_unit, who
 from adapter.gap.result import Finding, GapResult, Unseen
-from adapter.gap.words import alike, by_kind, carried_words, percent, shares_of, span, title_of
+from adapter.gap.words import (
+    alike,
+    by_kind,
+    carried_words,
+    noise_times,
+    percent,
+    shares_of,
+    span,
+    title_of,
+)
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
@@ -164,44 +173,29 @@ def unseen_table(result: GapResult) -> Table | None:
     return Table(heads, body) if body else None
 
 
+TIMES_NOISE = "× noise: in the band that the noise is of, where the joint slides."
+
+
 def error_table(result: GapResult) -> Table:
     """Errors before and after by joint: torque in N m and times its noise, rollouts in mrad."""
     before, after = result.before, result.after
     heads = ["Joint", "Noise", *["Before", "After"] * 2]
     units = ["", "N m", *["torque, N m"] * 2, *["× noise"] * 2]
-    decimals = [3, 3, 3, 1, 1]
     noise = np.asarray(result.noise_floor_nm, dtype=float)
-    floor = np.where(noise > 0.0, noise, np.nan)
-    columns = [
-        noise,
-        before.torque_rmse_nm,
-        after.torque_rmse_nm,
-        before.torque_rmse_nm / floor,
-        after.torque_rmse_nm / floor,
-    ]
-    for digits, factor, unit, key in (
-        (2, 1e3, "rollout, mrad", "rollout_rmse_rad"),
-        (1, 1e3, "rollout, mrad/s", "rollout_rmse_rad_s"),
+    columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *noise_times(result)]
+    for unit, key in (
+        ("rollout, mrad", "rollout_rmse_rad"),
+        ("rollout, mrad/s", "rollout_rmse_rad_s"),
     ):
         pair = getattr(before, key), getattr(after, key)
         if all(x is None or not np.isfinite(x).any() for x in pair):
             continue
         nothing = np.full(len(noise), np.nan)
-        columns += [nothing if x is None else factor * np.asarray(x, dtype=float) for x in pair]
+        columns += [nothing if x is None else 1e3 * np.asarray(x, dtype=float) for x in pair]
         heads += ["Before", "After"]
         units += [unit, unit]
-        decimals += [digits, digits]
-    rows = [
-        [
-            name,
-            *(
-                f"{x[j]:.{digits}f}" if np.isfinite(x[j]) else DASH
-                for x, digits in zip(columns, decimals, strict=True)
-            ),
-        ]
-        for j, name in enumerate(result.joint_names)
-    ]
-    return Table(heads, rows, units)
+    rows = [[name, *(plain(x[j]) for x in columns)] for j, name in enumerate(result.joint_names)]
+    return Table(heads, rows, units, TIMES_NOISE)
 
 
 def correction_table(result: GapResult) -> Table | None:

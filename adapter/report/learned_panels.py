@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import effects_by_name
+from adapter.effects.base import with_squares
 from adapter.gap.phrases import SHOWN_UNITS
 from adapter.model.inertia import PARAMETERS
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
@@ -196,7 +197,7 @@ def effect_panels(data: RunData) -> list[Panel]:
     panels = []
     for k, effect in enumerate(effects_by_name(names)):
         drawing = Drawing("quarter")
-        factor, unit = SHOWN_UNITS.get(effect.unit, (1.0, effect.unit))
+        factor, unit = SHOWN_UNITS.get(effect.unit, (1.0, with_squares(effect.unit)))
         lines_by_joint(drawing.axes[0], t, factor * values[:, k])
         _finish(drawing, t, data)
         title = effect.name.replace("_", " ").capitalize()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.active import Active, active_effects
-from adapter.effects.base import ALL
+from adapter.effects.base import ALL, with_squares
 from adapter.gap.phrases import SHOWN_UNITS
 from adapter.judgement.priors import is_shown
 from adapter.model.inertia import PARAMETERS, UNITS
@@ -24,8 +24,8 @@ LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 HIDDEN = 1e-6  # a share below it is none
 
 TIMES = {
-    "tick_us": "Compute: driver, filter, synthesis",
-    "loop_us": "Compute of the whole tick",
+    "tick_us": "Driver, filter, synthesis",
+    "loop_us": "The whole tick",
     "plant_us": "Physics of the simulated arm",
     "lateness_us": "Begin of the tick after its deadline",
     "period_us": "Period",
@@ -119,8 +119,9 @@ def effect_columns(
 ) -> dict[tuple[str, str], list[str]]:
     """Cells (n,) of each (head, unit): value ± standard deviation of effects by joint.
 
-    One of all joints stands at each of them; one of the flange at none. Of `fitted` (effect, key)
-    alone, where they are given.
+    One of all joints stands at each of them; one of the flange at none; what is the same of every
+    joint was chosen or is not shown, and is left out. Of `fitted` (effect, key) alone, where they
+    are given.
     """
     columns: dict[tuple[str, str], list[str]] = {}
     for active in effects:
@@ -131,7 +132,7 @@ def effect_columns(
             if np.ndim(value) or joints[0] < 0 or left_out:
                 continue
             given = effect.units()[key]
-            factor, unit = SHOWN_UNITS.get(given, (1.0, given))
+            factor, unit = SHOWN_UNITS.get(given, (1.0, with_squares(given)))
             head = effect.name.replace("_", " ").capitalize()
             column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * n)
             std = active.std.get(key)
@@ -140,7 +141,8 @@ def effect_columns(
                 shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown
-    return columns
+    chosen = {head for head, cells in columns.items() if len({*cells}) == 1 and n > 1}
+    return {head: cells for head, cells in columns.items() if head not in chosen}
 
 
 def schema_matrix(data: RunData) -> Matrix:
@@ -225,7 +227,8 @@ def changes_table(data: RunData) -> Table | None:
 
 def load_cells(at_s: float, load: Mapping[str, Any]) -> list[str]:
     """Since when, how heavy, where its centre is."""
-    centre = [number(1e3 * load[key]) for key in ("cx", "cy", "cz") if load.get(key) is not None]
+    known = [1e3 * load[key] for key in ("cx", "cy", "cz") if load.get(key) is not None]
+    centre = [f"{round(x, 1) + 0.0:.1f}".replace("-", "−") for x in known]
     mass = with_doubt(load["m"], load.get("m_std")) if load else DASH
     return [number(at_s, 4), mass, ", ".join(centre) or DASH]
 
@@ -258,7 +261,7 @@ def schema_table(data: RunData) -> Table:
         "what motion does not show is taken from the documentation."
     )
     units = ["", "rad", "rad", "rad", "m", "m", "m"]
-    return Table(["Joint", "α", "β", "γ", "pₓ", "p_y", "p_z"], rows, units, note)
+    return Table(["Joint", "α", "β", "γ", "p x", "p y", "p z"], rows, units, note)
 
 
 def provenance_rows(data: RunData) -> list[tuple[str, str, bool]]:

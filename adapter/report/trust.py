@@ -224,7 +224,8 @@ def _left(data: RunData) -> Check | None:
     j = int(np.argmax(slow))
     most = f"{100.0 * slow[j]:.0f} % of it on joint {j + 1}"
     if slow[j] <= SLOW:
-        return Check(GOOD, LEFT, f"{said}; like noise: at most {most} lasts over {BLOCK_S:g} s")
+        said += f"; like noise: at most {most} lasts over {BLOCK_S:g} s"
+        return Check(GOOD, LEFT, f"{said}; adapter gap holds it against the sensors' own noise")
     which = [int(k) + 1 for k in np.flatnonzero(slow > SLOW)]
     joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
     most = f"{'up to ' if len(which) > 1 else ''}{most}"
@@ -297,8 +298,8 @@ def _new(figures: Mapping[str, Any]) -> Check | None:
     new = figures.get("disagreements")
     if new is None:
         return Check(LOOK, "New disagreements", NOT_WATCHED)
-    if not_learned(figures):
-        return Check(BAD, "New disagreements", f"{len(new)}, listed among the warnings")
+    if left := not_learned(figures):
+        return Check(BAD, "New disagreements", f"{len(left)}, listed among the warnings")
     if new:
         said = f"{len(new)}, of a load that the model holds since it was noticed"
         return Check(GOOD, "New disagreements", said)
@@ -341,6 +342,8 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
 def _samples(figures: Mapping[str, Any]) -> Check:
     samples, learned = int(figures["samples"]), int(figures["learned"])
     said = f"{count(learned)} of {count(samples)} learned from"
+    if learned > samples:  # it went on from a checkpoint
+        said = f"{count(learned)} learned from, most before this run's {count(samples)}"
     lost = figures.get("unrecorded") or 0
     if lost:
         said += f"; {count(lost)} are missing in the recording"

@@ -97,6 +97,8 @@ addEventListener("load", () => {
     const said = one.outerHTML.slice(0, 120);
     if (box.right > wide + 1 && !one.closest(".said, pre")) outside.push(said);
     if (one.matches("td") && box.width * box.height === 0) lost.push(said);
+    const frame = one.closest(".scroll");
+    if (frame && box.right > frame.getBoundingClientRect().right + 1) outside.push(said);
   }
   const answer = { wide, scrolls: page.documentElement.scrollWidth - wide, outside, lost,
     cells: page.querySelectorAll("td").length };
@@ -110,8 +112,9 @@ def laid_out(page: str, folder: Path, width: int) -> dict[str, Any]:
     """How a page of that width lies in headless Chromium, with everything unfolded.
 
     Of the answer `wide` is the width, `scrolls` by how much the page is wider, `outside` what
-    reaches over its right edge, `lost` cells of tables without any area, `cells` how many there
-    are. The page runs in a frame, for no window can be so narrow.
+    reaches over its right edge or over that of what a table scrolls in, `lost` cells of tables
+    without any area, `cells` how many there are. The page runs in a frame, for no window can be
+    so narrow.
     """
     outer = MEASURE.replace("WIDTH", str(width)).replace("FOUND", FOUND)
     text = outer.replace("PAGE", html.escape(page))

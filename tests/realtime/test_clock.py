@@ -94,7 +94,6 @@ def test_physics_time_is_told_apart_and_an_empty_report_says_none():
     assert (report.ticks, report.missed_deadlines) == (10, 3)
     assert abs(report.tick_us["p50"] - 100) < 0.2 and abs(report.loop_us["max"] - 200) < 0.2
     assert abs(report.plant_us["p50"] - 200) < 0.4 and report.period_us["mean"] == 1000.0
-    assert any("3 deadlines missed" in line for line in report.lines())
 
 
 @pytest.mark.parametrize(("used_ms", "own"), [(0.2, 0), (1.2, 2), (4.0, 3)])

@@ -19,9 +19,11 @@ from adapter.gap.words import (
     console_summary,
     headline,
     leftover_sentence,
+    noise_times,
     rivals,
     sentence,
 )
+from adapter.model.numbers import plain
 from adapter.report.gap_page import render_gap_page
 from adapter.report.gap_panels import shown_joints
 from adapter.report.html import write_whole
@@ -105,12 +107,14 @@ def test_page_tells_the_finding(pages: dict[str, str]) -> None:
         "all joints, "
         "1.92 → 0.02 of joint 4, the worst.",
         "adapter diff nominal.json nominal+coulomb_friction.json",
-        "Fc = 2.000 ± 0.030 N m", "> 99.9 %", "load-dependent friction 97 %", "96.0",
+        "Fc = 2.000 ± 0.030 N m", "> 99.9 %", "load-dependent friction 97 %",
         "repeat the motion with a ladder of loads", "Forward simulation", "Against velocity",
         "Against position", "Against load", "Against acceleration", "Over time",
         "Not a finding", "+0.05 kg", "12 samples are repeated", "nominal+coulomb_friction.json",
     ):  # fmt: skip
         assert said in text, said
+    times = noise_times(result_of("one_finding"))  # the table, the tile and the check are of these
+    assert all(f" {plain(x[3])} " in text for x in times)
     assert pages["one_finding"].count("<svg") == 2 + 4 + 2
 
 
@@ -136,9 +140,11 @@ def test_what_is_many_times_the_noise_is_not_called_explained(pages: dict[str, s
     assert "nothing above the noise left" in text_of(pages["one_finding"])
 
 
-@pytest.mark.parametrize("kind", ["many", "pair"])
-def test_nothing_is_lost_on_a_phone(kind: str, pages: dict[str, str], tmp_path: Path) -> None:
-    found = laid_out(pages[kind], tmp_path, 420)
+@pytest.mark.parametrize(("kind", "width"), [("many", 420), ("pair", 420), ("many", 1100)])
+def test_nothing_is_lost_at_any_width(
+    kind: str, width: int, pages: dict[str, str], tmp_path: Path
+) -> None:
+    found = laid_out(pages[kind], tmp_path, width)
     assert found["scrolls"] <= 0
     assert found["outside"] == [] and found["lost"] == []
 
@@ -169,7 +175,7 @@ def test_unknown_rollouts_are_dashes_or_left_out(pages: dict[str, str]) -> None:
     one = result_of("one_finding")
     failed = replace(one.after, rollout_rmse_rad=np.full(7, np.nan), rollout_rmse_rad_s=None)
     text = text_of(render_gap_page(replace(one, after=failed)))
-    assert "80.00 – " in text
+    assert "80.0 – " in text
     assert "80 → – mrad" in text
 
 

@@ -322,9 +322,11 @@
     g.fillStyle = colors.muted;
     g.strokeStyle = colors.card;  // around the figures, or curves strike them through
     g.lineWidth = 4;
+    const decimals = Math.min(Math.max(0, 1 - Math.floor(Math.log10(high - low))), 7);  // two labels, two texts
     for (const [value, at] of [[high, 11], [low, h - 4]]) {
-      g.strokeText(number(value, 2), 3, at);
-      g.fillText(number(value, 2), 3, at);
+      const text = value.toFixed(decimals).replace("-", "−");
+      g.strokeText(text, 3, at);
+      g.fillText(text, 3, at);
     }
   };
 
@@ -361,7 +363,8 @@
   const drawWords = () => {
     if (!frame) return;
     put(by("headline"), frame.headline);
-    put(by("clock"), hello.duration_s ? `${frame.t.toFixed(1)} s of ${number(hello.duration_s)} s` : `${frame.t.toFixed(1)} s`);
+    const at = Math.min(frame.t, hello.duration_s || Infinity).toFixed(1);  // what comes after the end is of its stop
+    put(by("clock"), hello.duration_s ? `${at} s of ${number(hello.duration_s)} s` : `${at} s`);
     by("progress").style.width = hello.duration_s ? `${Math.min(100, 100 * frame.t / hello.duration_s)}%` : "0";
     document.title = `${hello.robot}: ${frame.headline}`;
     const last = estimates[estimates.length - 1];
