@@ -23,7 +23,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 run: $(WARM)
 	$(BIN)/adapter run --scenario as_built --seed 5 --duration 40 --feedforward learned --out runs/panda --overwrite
-	$(BIN)/adapter gap runs/panda/recording.mcap --model panda --out runs/panda/gap
+	$(BIN)/adapter gap runs/panda/recording.mcap --robot panda --out runs/panda/gap
 
 experiment: $(WARM)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json

@@ -23,12 +23,13 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     add("--to", type=Path, required=True, metavar="FILE", help="recording to write")
     _add_tables(parser)
     options.add_topic(parser)
-    add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
+    said = "the arm as documented, whose joints' names are taken, in its order"
+    add("--robot", metavar="NAME|FILE", help=said)
     add(
         "--joints",
         type=options.names_in,
         default=(),
-        metavar="LIST",
+        metavar="A,B,C",
         help="joint names, commas between",
     )
     said = "joints that are called otherwise: A in the source, B here; LEFT_*=* takes off a prefix"
@@ -81,8 +82,7 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE")
     options.add_topic(parser)
     _add_tables(parser)
-    parser.add_argument("--robot", metavar="NAME|FILE", help="predict what the recording teaches")
-    options.add_joints(parser)
+    options.add_robot(parser, "none, and nothing is said of what the recording teaches")
     options.add_told(parser)
     options.add_json(parser)
     parser.set_defaults(check=_check_info)

@@ -16,7 +16,6 @@ READ_S = 120.0  # of `discover`: as long as a recording that other commands hold
 
 
 GAP_WORDS = {
-    "--model": "self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
     "--servo": "recordings of a position-controlled arm (commanded and measured positions, no "
     "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
     "documented them, commands should be where the arm is)",
@@ -42,8 +41,7 @@ def declare_gap(parser: argparse.ArgumentParser) -> None:
     add = options.declaring(parser, GAP_WORDS)
     add("logs", nargs="+", type=Path, metavar="LOG", help="recording, or a folder of such")
     options.add_topic(parser)
-    add("--model", required=True, metavar="MODEL")
-    options.add_joints(parser)
+    options.add_robot(parser, "", "model")
     add("--servo", type=Path, metavar="FILE")
     options.add_told(parser)
     add("--inertia-prior", type=float, metavar="SHARE")
@@ -62,7 +60,7 @@ def _check_gap(args: argparse.Namespace) -> None:
     if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
     options.check_told(args)
-    options.check_robot(args.model)
+    options.need_robot(args.model)
 
 
 def declare_effects(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +92,6 @@ def add_effects(parser: argparse.ArgumentParser, default: Path | None = None) ->
 FLEET_WORDS = {
     "logs": "recording, folder (with those inside it), pattern ('logs/**/*.mcap'), or address "
     "that fsspec opens (s3://...); none: those of before alone",
-    "--model": "self model, .urdf, MJCF, or a robot's name",
     "--by": "what tells arms apart: the name or serial number in the log (default; the model's "
     "name where there is none), or the folder that it lies in",
     "--manifest": "a table with a column log, and arm, or numbers that friction may follow "
@@ -115,8 +112,7 @@ def declare_fleet(parser: argparse.ArgumentParser) -> None:
     add = options.declaring(parser, FLEET_WORDS)
     add("logs", nargs="*", metavar="LOG")
     options.add_topic(parser)
-    add("--model", required=True, metavar="MODEL")
-    options.add_joints(parser)
+    options.add_robot(parser, "", "model")
     options.add_told(parser)
     add("--by", choices=("log", "folder"), default="log")
     add("--manifest", type=Path, metavar="CSV")
@@ -132,7 +128,7 @@ def declare_fleet(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_fleet(args: argparse.Namespace) -> None:
-    options.check_robot(args.model)
+    options.need_robot(args.model)
     options.check_told(args)
     if args.learn_gains:
         raise UsageError("--tau-gain fit: learn gains with `gap` or `replay`, and give them here")
@@ -163,8 +159,7 @@ def declare_load(parser: argparse.ArgumentParser) -> None:
     add("log", type=Path, metavar="LOG", help="recording with the load, moving or at rest")
     options.add_topic(parser)
     add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
-    add("--robot", metavar="NAME|FILE", help="documented robot; the log's own, else panda")
-    options.add_joints(parser)
+    options.add_robot(parser, "the log's own, else panda")
     options.add_told(parser)
     add("--frame", metavar="NAME", help="in whose axes (default: the flange of the last link)")
     add("--inertia-prior", type=float, metavar="SHARE")
@@ -225,7 +220,7 @@ def declare_discover(parser: argparse.ArgumentParser) -> None:
     add("--seconds", type=float, default=READ_S, metavar="S")
     add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
     add("--base", metavar="LINK")
-    add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
+    add("--model", type=Path, metavar="FILE", help="write what was learned, a model file (.json)")
     options.add_json(parser)
     parser.set_defaults(check=_check_discover)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -37,12 +38,12 @@ def declaring(
 def add_learning(parser: argparse.ArgumentParser) -> None:
     """Options of everything that learns."""
     add = parser.add_argument
-    add_robot(parser)
+    add_robot(parser, "panda; of a recording its own")
     add("--config", type=Path, metavar="FILE", help="settings in TOML")
     add("--mode", choices=MODES, help="moments (default) or the paper's sample")
     add(
         "--effects",
-        metavar="LIST",
+        metavar="LIST|FILE",
         help="effects learned beside θ: none, real, or names with commas between (a name that "
         "does not exist lists them), a file of kept laws (.toml) among them",
     )
@@ -52,11 +53,30 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
     add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
-    """Which arm, and how it is mounted."""
-    said = "panda (default), fr3, .urdf, .xml (MJCF) or .json"
-    parser.add_argument("--robot", metavar="NAME|FILE", help=said)
+class _OtherWord(argparse.Action):
+    """Takes --model where it can only be --robot, and says so."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, where: argparse.Namespace, value: Any, said: Any = ""
+    ) -> None:
+        print(f"{said} is --robot here: the arm as documented", file=sys.stderr)
+        setattr(where, self.dest, value)
+
+
+def add_robot(parser: argparse.ArgumentParser, default: str = "panda", dest: str = "robot") -> None:
+    """Which arm, as documented, what is taken where nobody says, and how it is mounted."""
+    said = f"the arm as documented: panda, fr3, .urdf, .xml (MJCF), .json; default: {default}"
+    kinds = "NAME|FILE"
+    parser.add_argument("--robot", dest=dest, metavar=kinds, help=said.removesuffix("; default: "))
+    parser.add_argument("--model", dest=dest, action=_OtherWord, help=argparse.SUPPRESS)
     add_joints(parser)
+
+
+def need_robot(name: str | None) -> None:
+    """Refuse that nobody says which arm recordings are held against. Raises UsageError."""
+    if name is None:
+        raise UsageError(f"missing: --robot; have: {', '.join([*robot_names(), *ROBOT_FILES])}")
+    check_robot(name)
 
 
 def add_joints(parser: argparse.ArgumentParser) -> None:

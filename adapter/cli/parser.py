@@ -18,7 +18,7 @@ class Parser(argparse.ArgumentParser):
     """As argparse's, with other sentences, and without the usage of all options before them."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        # an option cut short would be another one's, `--mode` of `run` `--model` of `gap`
+        # an option cut short would be another one's: `--mode` is no `--model`
         super().__init__(*args, **{"allow_abbrev": False, **options})
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:

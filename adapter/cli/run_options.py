@@ -154,7 +154,7 @@ def declare_excite(parser: argparse.ArgumentParser) -> None:
     add = options.declaring(parser, EXCITE_WORDS)
     add("logs", nargs="*", type=Path, metavar="LOG", help="recordings of the arm that are there")
     options.add_robot(parser)
-    add("--config", type=Path, metavar="FILE", help="settings in TOML: [cell], [excitation], ...")
+    add("--config", type=Path, metavar="FILE", help="settings in TOML")
     add("--at", metavar="Q1,Q2,...")
     add("--std", type=float, default=SHARE, metavar="SHARE")
     add("--noise", metavar="S1,S2,...")

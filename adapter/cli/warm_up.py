@@ -25,7 +25,7 @@ def warm_up() -> int:
         common = ["--quiet", "--no-report", "--out"]
         live = ["run", "--scenario", "as_built", "--set", "t_s=2", "--feedforward", "learned"]
         live += ["--duration", "4", "--no-record"]
-        search = ["gap", LOG, "--model", "panda", *common, f"{name}/gap"]
+        search = ["gap", LOG, "--robot", "panda", *common, f"{name}/gap"]
         again = ["replay", LOG, *common, f"{name}/again"]
         lanes = [[*live, *common, f"{name}/run"]], [search, again]
         with ProcessPoolExecutor(len(lanes), get_context("spawn")) as processes:

@@ -78,7 +78,7 @@ def bench(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--repeats", type=int, default=2000, metavar="N", help="default 2000")
     add("--log", type=Path, metavar="LOG", help="recording of an arm to compare held-out torque on")
-    add("--robot", default="panda", metavar="ROBOT", help="the arm of LOG; default panda")
+    add("--robot", default="panda", metavar="NAME|FILE", help="the arm as documented")
     add(
         "--validate-from",
         type=float,

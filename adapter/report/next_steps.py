@@ -18,6 +18,11 @@ MOST = 4
 LEARNED_SHARE = 0.7  # of a recording that is learned from where the rest is held out
 LONGER = 2.0  # times the duration of a run that was too short
 SIMULATED = "pybullet"
+# Options that make a recording readable, which whoever reads it next needs, too
+HOW_READ = (
+    *("--topic", "--turn", "--zero", "--tau", "--tau-gain", "--gear", "--known-load", "--loaded"),
+    "--trust-log",
+)
 # Options of a run that the next one does not repeat
 ITS_OWN = (
     *("--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"),
@@ -39,7 +44,7 @@ def next_steps(data: RunData, worth: Worth) -> list[Step]:
     files = _Files(data)
     if refusal(data.figures):
         why = "Mend it in the driver or the model; a log is taken with what the sentence names"
-        return [Step(why, command("replay", *files.logs or ["LOG"]))]
+        return [files.read(why, "replay", files.logs)]
     started = theta_started(data)
     found: list[Step | None] = []
     fall, slow = worth.torque, slow_share(data) if started else None
@@ -63,6 +68,14 @@ def command(*words: Any) -> str:
     return shlex.join(["adapter", *map(str, words)])
 
 
+def _told(data: RunData) -> list[str]:
+    """Words of the command that the run was begun by; none where it is no command."""
+    try:
+        return shlex.split(str(data.model.provenance.get("command") or ""))
+    except ValueError:
+        return []
+
+
 class _Files:
     """Names of what the run left, and how commands take them."""
 
@@ -71,10 +84,19 @@ class _Files:
         self.documented = str(Path(self.model).with_name("documented.json"))
         logs = data.figures.get("recordings")
         self.logs: list[str] = [str(log) for log in logs] if logs else []
+        self.read_as: list[str] = []
+        keep = False
+        for word in _told(data):
+            option = word.startswith("--")
+            keep = word.partition("=")[0] in HOW_READ if option else keep and word not in self.logs
+            self.read_as += [word] if keep else []
 
     def gap(self, why: str) -> Step:
-        logs = self.logs or ["LOG"]
-        return Step(why, command("gap", *logs, "--model", self.documented))
+        return self.read(why, "gap", self.logs, "--robot", self.documented)
+
+    def read(self, why: str, name: str, logs: Sequence[str], *more: str) -> Step:
+        """A command that reads recordings as this run did."""
+        return Step(why, command(name, *(logs or ["LOG"]), *more, *self.read_as))
 
 
 def _longer(data: RunData, files: _Files) -> Step:
@@ -89,12 +111,12 @@ def _longer(data: RunData, files: _Files) -> Step:
             return Step(why, command(*words, "--passive"))
         return Step(why, command(*words, "--excitation", "designed", *more))
     why = "The learner had not settled: see what this motion lacks"
-    return Step(why, command("info", *files.logs[:1] or ["LOG"], "--robot", files.documented))
+    return files.read(why, "info", files.logs[:1], "--robot", files.documented)
 
 
 def _again(data: RunData) -> list[str]:
     """Words of a run of the same arm: those of this one, but what it was to do and to leave."""
-    told = shlex.split(str(data.model.provenance.get("command") or ""))
+    told = _told(data)
     if told[:2] != ["adapter", "run"]:  # it was begun from Python
         scenario = data.figures.get("scenario")
         more = ["--scenario", str(scenario)] if scenario else []
@@ -150,7 +172,7 @@ def _held_out(data: RunData, files: _Files) -> Step | None:
         return None
     at = f"{LEARNED_SHARE * span_s:.3g}"
     why = "Judge the model on data that it never saw"
-    return Step(why, command("replay", files.logs[0], "--validate-from", at))
+    return files.read(why, "replay", files.logs, "--validate-from", at)
 
 
 def _use(data: RunData, files: _Files) -> list[Step]:

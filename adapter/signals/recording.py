@@ -198,7 +198,7 @@ def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
         said.append(f"at rest: {', '.join(resting)}")
     if _of_servos(log):
         said.append(
-            "no torques: the servos and no inertias; `adapter gap LOG --model ROBOT` finds gain, "
+            "no torques: the servos and no inertias; `adapter gap LOG --robot ROBOT` finds gain, "
             "delay and friction of each joint that moves"
         )
         return "; ".join(said)

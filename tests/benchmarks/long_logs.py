@@ -84,7 +84,7 @@ def commands(log: Path, every: list[int], folder: Path, gap: bool) -> dict[str, 
         found[f"replay --every {count}"] = [*replay, "--every", str(count)]
     if gap:
         out = str(folder / f"gap_{log.stem}_{time.time_ns()}")
-        found["gap"] = [*adapter, "gap", str(log), "--model", "panda", "--out", out, "--quiet"]
+        found["gap"] = [*adapter, "gap", str(log), "--robot", "panda", "--out", out, "--quiet"]
     return found
 
 

@@ -89,7 +89,7 @@ def test_a_gripper_that_the_log_lacks_is_locked(tmp_path, capsys, refused) -> No
     assert main([*replay, "--joints", chosen, "--out", str(out)]) in LEARNED
     assert "has no joint" not in capsys.readouterr().err
     still = record(tmp_path / "still.mcap", motion(20) * 3)
-    said = refused("gap", still, "--model", robot, "--out", out)  # too short, not foreign
+    said = refused("gap", still, "--robot", robot, "--out", out)  # too short, not foreign
     assert "usable samples" in said
     said = refused("replay", log, "--robot", robot, "--lock", "thumb=1")
     assert "'thumb'" in said and "finger_joint" in said

@@ -18,7 +18,7 @@ RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 
 
 def fleet(*arguments: object) -> int:
-    return main(["fleet", *map(str, arguments), "--model", "panda", "--workers", "0"])
+    return main(["fleet", *map(str, arguments), "--robot", "panda", "--workers", "0"])
 
 
 @pytest.fixture
@@ -74,4 +74,4 @@ def test_without_pyarrow_a_csv_table(
     ],
 )
 def test_what_cannot_be_is_said(arguments: tuple[object, ...], said: str, refused) -> None:
-    assert said in refused("fleet", *arguments, "--model", "panda", "--workers", "0")
+    assert said in refused("fleet", *arguments, "--robot", "panda", "--workers", "0")

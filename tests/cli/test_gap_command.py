@@ -41,7 +41,7 @@ def trial(seed: int, seconds: float, effects: Sequence[Effect] = (COULOMB,)) -> 
 def gap(folder: Path, model: Path | str, logs: Sequence[Path], *options: object) -> dict[str, Any]:
     """Run the command; its exit code (key `exit`) and what it wrote."""
     figures = folder / "figures.json"
-    words = ["gap", *logs, "--model", model, "--json", figures, "--out", folder / "out", "--quiet"]
+    words = ["gap", *logs, "--robot", model, "--json", figures, "--out", folder / "out", "--quiet"]
     code = main([str(word) for word in (*words, *options)])
     return {"exit": code, **json.loads(figures.read_text())}
 
@@ -112,7 +112,7 @@ def test_the_new_model_explains_more_and_the_old_one_stays(
 def test_a_model_is_never_written_over(data: Path, tmp_path: Path, refused) -> None:
     model = save_model(documented(data / "arm.urdf"), tmp_path / "model.json")
     before = model.read_bytes()
-    refused("gap", data / "one.mcap", "--model", model, "--out", tmp_path)
+    refused("gap", data / "one.mcap", "--robot", model, "--out", tmp_path)
     assert model.read_bytes() == before
 
 
@@ -146,7 +146,7 @@ def test_validate_from(data: Path, tmp_path: Path, refused) -> None:
     assert figures["before"]["rollout_rmse_rad"] is None and "report" not in figures
     assert figures["after"]["torque_rmse_nm"][3] < 0.2 * figures["before"]["torque_rmse_nm"][3]
     assert not (tmp_path / "out" / "report.html").exists()
-    words = ["gap", data / "one.mcap", "--model", data / "arm.urdf", "--out", tmp_path]
+    words = ["gap", data / "one.mcap", "--robot", data / "arm.urdf", "--out", tmp_path]
     refused(*words, "--validate-from", 11.0)
 
 

@@ -65,7 +65,7 @@ def test_topic_and_folder(tmp_path, capsys, refused):
     assert main(["info", str(bag), "--topic", "/b/state"]) == 0
     assert "joint states: /b/state" in capsys.readouterr().out
     (tmp_path / "empty").mkdir()
-    for command in (["replay"], ["gap", "--model", "panda"]):
+    for command in (["replay"], ["gap", "--robot", "panda"]):
         assert "no recording in this folder" in refused(*command, tmp_path / "empty")
     logs = tmp_path / "logs"
     logs.mkdir()

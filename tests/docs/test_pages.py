@@ -4,7 +4,18 @@ import re
 
 import pytest
 
-from tests.helpers.pages import NOT_GIVEN, PAGES, PYTHON, ROOT, blocks, every_command, given
+from adapter.cli.main import build_parser
+from tests.helpers.pages import (
+    NOT_GIVEN,
+    PAGES,
+    PYTHON,
+    ROOT,
+    blocks,
+    every_command,
+    given,
+    options_of_commands,
+    table_of_options,
+)
 
 DRAWN = "figures/"  # when the site is built, by docs/site/figures.py
 # What a block of Python in a page calls, and so which test of test_commands.py runs it
@@ -33,3 +44,24 @@ def test_the_commands_for_simulated_hardware_are_those_that_are_given() -> None:
 def test_every_block_of_python_is_run() -> None:
     own = [block for page in PAGES if page.startswith("docs/") for block in blocks(PYTHON, page)]
     assert [sum(call in block for call in RUN) for block in own] == [1] * len(RUN)
+
+
+def test_options_stand_in_a_table_and_no_word_means_two_things(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One word takes one kind of value everywhere, or some of what it takes elsewhere; the arm as
+    documented is --robot in every command, what was learned is --model."""
+    assert table_of_options() in PAGES["docs/commands.md"], "python -m tests.helpers.pages"
+    found = options_of_commands()
+    for name, senses in found.items():
+        takes = [{*kind.split("|")} for kind, _ in senses]
+        assert all(one <= max(takes, key=len) for one in takes), (name, senses)
+    for name, begins, more in (
+        ("--robot", "the arm as documented", 8),
+        ("--model", "write what", 0),
+    ):
+        senses = found[name]
+        assert all(said.startswith(begins) for _, said in senses), senses
+        assert sum(map(len, senses.values())) > more
+    assert build_parser().parse_args(["gap", "x.mcap", "--model", "panda"]).model == "panda"
+    assert "--model is --robot here" in capsys.readouterr().err

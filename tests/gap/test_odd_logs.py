@@ -327,7 +327,7 @@ def test_a_mended_log_has_the_names_of_the_clean_one() -> None:
 
 def test_a_fleet_takes_what_it_left_out(tmp_path) -> None:
     path, out = written(turned(2), tmp_path / "odd.mcap"), str(tmp_path / "out")
-    fleet = ["fleet", str(path), "--model", "panda", "--workers", "0", "--out", out]
+    fleet = ["fleet", str(path), "--robot", "panda", "--workers", "0", "--out", out]
     assert main([*fleet, "--no-report"]) == 8
     assert main([*fleet, "--no-report", "--turn", "panda_joint3"]) == 0
 

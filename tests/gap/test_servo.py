@@ -163,7 +163,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[PositionArm, Pat
 
 def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -> None:
     arm, seen, unseen = recorded
-    words = ["gap", str(seen), "--model", "panda", "--quiet"]
+    words = ["gap", str(seen), "--robot", "panda", "--quiet"]
     asked = [*words, "--hold-out", str(unseen), "--out", str(tmp_path / "one")]
     assert main(asked) == 0
     said = capsys.readouterr().out
@@ -174,7 +174,7 @@ def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -
     assert {f["effect"] for f in figures["findings"]} == {e for e, _ in arm.expected}
     servos = str(tmp_path / "one" / "servo.toml")
     assert figures["servos_out"] == servos
-    again = ["gap", str(unseen), "--model", "panda", "--quiet", "--servo", servos]
+    again = ["gap", str(unseen), "--robot", "panda", "--quiet", "--servo", servos]
     assert main([*again, "--out", str(tmp_path / "two")]) == 0
     assert "does what its servos' documentation says" in capsys.readouterr().out
     assert not json.loads((tmp_path / "two" / "gap.json").read_text())["findings"]
@@ -182,7 +182,7 @@ def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -
 
 def test_what_does_not_belong_to_such_a_recording_is_refused(recorded, tmp_path, capsys) -> None:
     _, seen, _ = recorded
-    words = ["gap", str(seen), "--model", "panda", "--out", str(tmp_path / "out")]
+    words = ["gap", str(seen), "--robot", "panda", "--out", str(tmp_path / "out")]
     assert main([*words, "--tau-gain", "2"]) == 2
     assert "--tau-gain: for recordings with torques" in capsys.readouterr().err
     torque = tmp_path / "torque.mcap"
@@ -192,7 +192,7 @@ def test_what_does_not_belong_to_such_a_recording_is_refused(recorded, tmp_path,
     assert read_position_log(torque) is None
     assert main([*words, "--hold-out", str(torque)]) == 2
     assert "give recordings of one kind" in capsys.readouterr().err
-    asked = ["gap", str(torque), "--model", "panda", "--servo", str(tmp_path / "none.toml")]
+    asked = ["gap", str(torque), "--robot", "panda", "--servo", str(tmp_path / "none.toml")]
     assert main(asked) == 2
     assert "holds no position commands" in capsys.readouterr().err
 

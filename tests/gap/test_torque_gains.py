@@ -160,7 +160,7 @@ def test_given_gains_and_gears_convert() -> None:
 def test_options_that_mean_nothing(command: str, options: list[str], said: str, tmp_path, capfd):  # type: ignore[no-untyped-def]
     log = tmp_path / "log.mcap"
     log.touch()
-    robot = ["--model", "panda"] if command == "gap" else []
+    robot = ["--robot", "panda"] if command == "gap" else []
     words = [str(log) if word == "LOG" else word for word in options]
     assert main([command, str(log), *robot, *words]) == 2
     assert said in " ".join(capfd.readouterr().err.split())
@@ -172,7 +172,7 @@ def test_commands_refuse_currents(tmp_path: Path, capfd: pytest.CaptureFixture[s
     write_log(log, path, {})
     assert main(["info", str(path), "--robot", "panda"]) == 0
     assert "looks like motor current" in " ".join(capfd.readouterr().out.split())
-    for arguments in (["gap", str(path), "--model", "panda"], ["replay", str(path)]):
+    for arguments in (["gap", str(path), "--robot", "panda"], ["replay", str(path)]):
         out = ["--out", str(tmp_path / arguments[0]), "--no-report"]
         assert main([*arguments, *out]) == 2
         assert "looks like motor current" in " ".join(capfd.readouterr().err.split())

@@ -1,11 +1,14 @@
 """What users read, README and pages, and its commands given as a shell would."""
 
+import argparse
 import os
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+
+from adapter.cli.main import build_parser
 
 PATIENCE_S = 1500.0  # with a command, on a machine with other work
 ROOT = Path(__file__).parents[2]
@@ -77,3 +80,34 @@ def give(line: str, folder: Path, codes: tuple[int, ...] = (0,)) -> tuple[int, s
     )
     assert done.returncode in codes, f"{line}\n{done.stderr}"
     return done.returncode, done.stderr
+
+
+def options_of_commands() -> dict[str, dict[tuple[str, str], list[str]]]:
+    """Each option of the command line: what it takes and its sense, with the commands that mean it
+    so; words that are taken for another one are left out."""
+    parts = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    found: dict[str, dict[tuple[str, str], list[str]]] = {}
+    for command, part in parts.choices.items():
+        for action in part._actions:
+            said = action.help or ""
+            for name in (x for x in action.option_strings if x.startswith("--") and x != "--help"):
+                takes = action.metavar or "|".join(map(str, action.choices or ()))
+                takes = " ".join(takes) if isinstance(takes, tuple) else takes
+                if said != argparse.SUPPRESS:
+                    senses = found.setdefault(name, {})
+                    senses.setdefault((takes, said.replace("%%", "%")), []).append(command)
+    return found
+
+
+def table_of_options() -> str:
+    """The table of docs/commands.md; `python -m tests.helpers.pages` prints it."""
+    lines = ["| option | takes | sense | commands |", "|---|---|---|---|"]
+    for name, senses in sorted(options_of_commands().items()):
+        for (takes, said), commands in senses.items():
+            cells = f"`{name}`", f"`{takes}`" if takes else "", said, ", ".join(commands)
+            lines.append(f"| {' | '.join(x.replace('|', chr(92) + '|') for x in cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(table_of_options())

@@ -302,6 +302,12 @@ def test_next_steps_are_commands_of_this_program(data: RunData) -> None:
     lost = {**data.figures["theta"], "converged_s": None}
     seen = set()
     failed = with_figures(given, theta=lost)
+    how = "--turn panda_joint2 --tau-gain -1 --tau-gain=2 --topic /a"
+    told = {"command": f"adapter replay it.mcap {how.replace(' -1', ' -1 --out x')}"}
+    turned = replace(given.model, provenance=told)
+    odd = replace(with_figures(given, recordings=["it.mcap"]), model=turned)
+    read = [x.command for x in next_steps(odd, Worth.of(odd)) if "it.mcap" in x.command]
+    assert read and all(line.endswith(how) for line in read)
     for run in (given, failed, with_figures(failed, timing=None)):
         steps = next_steps(run, Worth.of(run))
         assert 2 <= len(steps) <= 4

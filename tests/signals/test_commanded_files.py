@@ -123,7 +123,7 @@ def test_a_folder_of_sage_and_what_is_said_of_it(tmp_path, capsys):
         said = capsys.readouterr().out
         for words in ("500 commanded positions", "rms: 30  50 mrad", "no efforts", "the servos"):
             assert words in said
-        assert "problem" not in said and "adapter gap LOG --model" in said
+        assert "problem" not in said and "adapter gap LOG --robot" in said
 
 
 def test_efforts_of_zero_are_none(tmp_path, capsys):

@@ -54,7 +54,7 @@ IN_ROS1 = {  # every field of this name
 def answered(path, capsys):
     """What `info` says; `gap` refuses the same bag with one sentence."""
     said = []
-    for command in (["info"], ["gap", "--model", "panda", "--no-report"]):
+    for command in (["info"], ["gap", "--robot", "panda", "--no-report"]):
         code = main([command[0], str(path), *command[1:]])
         told = capsys.readouterr()
         assert "Traceback" not in told.out + told.err
