@@ -8,6 +8,7 @@ from importlib import import_module
 
 import numpy as np
 
+from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
 from adapter.effects.base import with_squares
 from adapter.effects.robots import read_robot
@@ -90,7 +91,8 @@ def run_info(args: argparse.Namespace) -> int:
     write_json(args.json, facts)
     for line in lines:
         show(line)
-    return 0
+    asked = args.topic is not None and facts.get("problem") is not None
+    return ExitCode.WRONG_USE if asked else ExitCode.DONE
 
 
 def opened(args: argparse.Namespace) -> Log | None:

@@ -19,7 +19,7 @@ from adapter.model.model_file import save_model, whole_file
 from adapter.report.fleet_page import (
     HEADS,
     as_json,
-    log_cells,
+    log_rows,
     sentences,
     summary,
     to_be_shown,
@@ -133,8 +133,8 @@ def _print(arm: FleetArm) -> None:
     table = Table(box=None, pad_edge=False, title=arm.name, title_justify="left")
     for number, head in enumerate(HEADS):
         table.add_column(head, no_wrap=number > 0, overflow="fold")
-    for k in shown:
-        table.add_row(*log_cells(arm.logs[k]))
+    for row in log_rows(arm, shown):
+        table.add_row(*row)
     output.print(table)
     if len(shown) < len(arm.logs):
         show(f"{len(arm.logs) - len(shown)} recordings of which nothing is to be said")

@@ -187,6 +187,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     parser = build_parser()
     completion.complete(parser)
+    if not (sys.argv[1:] if arguments is None else arguments):
+        parser.print_help()
+        return ExitCode.WRONG_USE
     args = parser.parse_args(arguments)
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
@@ -213,6 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(error)
         return ExitCode.WRONG_USE
     except KeyboardInterrupt:
+        complain("interrupted, before there were results")
         return ExitCode.INTERRUPTED
 
 

@@ -11,6 +11,7 @@ nothing but the new model where it is told where.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -289,8 +290,10 @@ def _divided(taken: _Taken, model: SelfModel, settings: GapSettings, progress: P
 def names_of(logs: Sequence[Path | str | Log]) -> list[str]:
     """What recordings are called: their files' names, with folders where two have the same."""
     paths = [log.path if isinstance(log, Log) else Path(log) for log in logs]
-    short = [path.name for path in paths]
-    names = [str(p) if short.count(p.name) > 1 else p.name for p in paths]
+    names = [path.name for path in paths]
+    for k in range(2, max((len(path.parts) for path in paths), default=0) + 1):
+        count, pairs = Counter(names), zip(names, paths, strict=True)
+        names = [str(Path(*p.parts[-k:])) if count[x] > 1 else x for x, p in pairs]
     again = [names[:k].count(name) for k, name in enumerate(names)]
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, again, strict=True)]
 

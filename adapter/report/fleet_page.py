@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import KNOWN
+from adapter.gap.workflow import names_of
 from adapter.model.numbers import plus_minus
 from adapter.report.html import fill, write_whole
 from adapter.report.style import Drawing, Panel, joint_color, legend
@@ -28,14 +29,23 @@ LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
 MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording, as figures
 
 
-def log_cells(log: OfLog) -> tuple[str, ...]:
-    """A recording's row under `HEADS`."""
+def log_rows(arm: FleetArm, numbers: Iterable[int]) -> list[tuple[str, ...]]:
+    """Recordings as rows under `HEADS`, by their numbers."""
+    names = called(arm)
+    return [(names[k], *_log_cells(arm.logs[k])) for k in numbers]
+
+
+def called(arm: FleetArm) -> list[str]:
+    """Names of an arm's recordings, with folders where two files have the same."""
+    return names_of([log.moments.path for log in arm.logs])
+
+
+def _log_cells(log: OfLog) -> tuple[str, ...]:
     worst, begin_s = int(np.argmax(log.rmse)), log.moments.begin_s
     begins = f"{begin_s:.1f} s"
     if begin_s >= EPOCH_S:
         begins = f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
     return (
-        Path(log.moments.path).name,
         begins,
         f"{log.moments.span_s:.0f}",
         "" if log.load is None else _signed(*log.load),
@@ -75,7 +85,7 @@ def drift_words(drift: Drift) -> str:
 
 def standing_out_words(arm: FleetArm) -> Iterator[str]:
     """A sentence for each recording with parameters that the others do not have."""
-    by_log: dict[int, list[StandsOut]] = {}
+    names, by_log = called(arm), dict[int, list[StandsOut]]()
     for one in arm.standing_out:
         by_log.setdefault(one.number, []).append(one)
     for number, several in sorted(by_log.items()):
@@ -84,27 +94,28 @@ def standing_out_words(arm: FleetArm) -> Iterator[str]:
             f"{KNOWN[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
             for x in several
         ]
-        yield f"{Path(arm.logs[number].moments.path).name} stands out: {'; '.join(told)}"
+        yield f"{names[number]} stands out: {'; '.join(told)}"
 
 
 def sentences(arm: FleetArm) -> list[str]:
     """What there is to say of an arm's recordings."""
     found = [drift_words(x) for x in arm.drifts]
-    for log in arm.logs:
+    names = called(arm)
+    for name, log in zip(names, arm.logs, strict=True):
         if log.disagrees:
             worst = int(np.argmax(log.rmse / log.own_rmse))
             found.append(
-                f"{Path(log.moments.path).name} disagrees with the others on "
+                f"{name} disagrees with the others on "
                 f"joint {', '.join(map(str, log.disagrees))}: {log.rmse[worst]:.2g} N m on joint "
                 f"{worst + 1} where a model of its own leaves {log.own_rmse[worst]:.2g}; another "
                 f"arm, or a change{'' if log.used else '; the model is learned without it'}"
             )
     found += standing_out_words(arm)
-    used = [x for x in arm.logs if x.used]
+    used = [(x, name) for name, x in zip(names, arm.logs, strict=True) if x.used]
     if len(used) > 1:
-        best = max(used, key=lambda x: x.worth)
+        best, name = max(used, key=lambda one: one[0].worth)
         found.append(
-            f"The motion of {Path(best.moments.path).name} would teach most if repeated: standard "
+            f"The motion of {name} would teach most if repeated: standard "
             f"deviations would be {_less(best.worth)} less (geometric mean)"
         )
     return found
@@ -187,7 +198,7 @@ def _arm(arm: FleetArm) -> dict[str, Any]:
     numbers = to_be_shown(arm, MOST_ROWS)
     left = len(arm.logs) - len(numbers)
     note = f"{left} more in the table file; here are those there is something to say of"
-    logs = Table(HEADS, [log_cells(arm.logs[k]) for k in numbers], note=note * (left > 0))
+    logs = Table(HEADS, log_rows(arm, numbers), note=note * (left > 0))
     used = [x for x in arm.logs if x.used]
     panels = _courses(arm, used) if len(used) > 1 else []
     told = {"name": arm.name, "lines": sentences(arm), "parameters": _parameters(arm)}

@@ -73,7 +73,7 @@ def import_file(spec: ImportSpec, out: Path) -> ImportReport:
             likely; the sentence names file, line or column, and the choices.
     """
     if out.exists() and not spec.overwrite:
-        raise DriverError(f"{out}: exists; choose another name or delete it")
+        raise DriverError(f"{out}: exists; choose another name, or --overwrite to replace it")
     try:
         version = importlib.metadata.version("panda-adapter")
     except importlib.metadata.PackageNotFoundError:

@@ -72,7 +72,6 @@ def test_a_wrong_option_is_told_with_the_likeliest(command: str, here: Path, ref
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("", "missing: COMMAND"),
         ("replya x", "did you mean replay?"),
         ("run --duration soon", "--duration: takes a number, got 'soon'"),
         ("run --seed 1.5", "--seed: takes a whole number, got '1.5'"),

@@ -13,6 +13,7 @@ import pytest
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
 from adapter.model.model_file import load_model
+from drivers.files.mcap import read_log, write_log
 
 RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 
@@ -50,6 +51,18 @@ def test_what_is_left_behind(folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert fleet("--out", out, "--forget", folder / "logs" / "left" / "one.mcap") == (
         ExitCode.NOTHING_LEARNED
     )
+
+
+def test_recordings_of_one_name_are_told_apart_by_their_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for day in ("monday", "friday"):
+        (tmp_path / day).mkdir()
+    shutil.copy(RECORDING, tmp_path / "monday" / "recording.mcap")
+    write_log(read_log(RECORDING), tmp_path / "friday" / "recording.mcap", {})
+    assert fleet(tmp_path, "--out", tmp_path / "out", "--no-report") == 0
+    said = capsys.readouterr().out.replace("\n", "")
+    assert "monday/recording.mcap" in said and "friday/recording.mcap" in said
 
 
 def test_without_pyarrow_a_csv_table(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
+from adapter.cli.exit_codes import ExitCode
 from adapter.control.teachable import teachable
 from adapter.model.robots import documented
 from drivers.files.mcap import McapWriter, read_log
@@ -64,6 +65,8 @@ def test_topic_and_folder(tmp_path, capsys, refused):
     assert "2 topics tell joint states: /a/state, /b/state" in capsys.readouterr().out
     assert main(["info", str(bag), "--topic", "/b/state"]) == 0
     assert "joint states: /b/state" in capsys.readouterr().out
+    assert main(["info", str(bag), "--topic", "/nope"]) == ExitCode.WRONG_USE
+    assert "problem: " in capsys.readouterr().out
     (tmp_path / "empty").mkdir()
     for command in (["replay"], ["gap", "--robot", "panda"]):
         assert "no recording in this folder" in refused(*command, tmp_path / "empty")

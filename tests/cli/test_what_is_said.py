@@ -54,6 +54,8 @@ def test_results_go_to_the_standard_output(
         assert (
             said.out and said.err.endswith(" ...\n") and said.err.count("\n") == 1
         )  # what it does
+    assert main([]) == ExitCode.WRONG_USE
+    assert "COMMAND" in capsys.readouterr().out  # the help
     assert main(["info", "gone.json"]) == ExitCode.WRONG_USE
     said = capsys.readouterr()
     assert said.err.startswith("error: ") and not said.out  # before anything is done
