@@ -23,7 +23,7 @@ from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
 from adapter.report.next_steps import next_steps
 from adapter.report.trust import headline
-from adapter.report.words import NOT_WATCHED, is_live, missed_words, not_learned, small
+from adapter.report.words import NOT_WATCHED, not_learned, small
 from adapter.report.worth import Worth
 from adapter.runs.outcome import Outcome
 from adapter.runs.run_folder import RunData, load_run, run_data, save_run
@@ -101,7 +101,7 @@ def print_figures(data: RunData, report: str | None, accounts: Sequence[str]) ->
 
 def _figures(figures: dict[str, Any], report: str | None) -> Table:
     start_s = figures.get("start_s") or 0.0
-    lam, theta, tick = figures["lambda"], figures["theta"], figures["tick_us"]
+    lam, theta = figures["lambda"], figures["theta"]
     table = Table("", Column("", overflow="fold"), show_header=False, box=None, pad_edge=False)
     reasons = figures["refused"].items()
     refused = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in reasons)
@@ -133,12 +133,6 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     if theta["validation_torque_rmse_nm"]:
         values = " ".join(f"{value:.3f}" for value in theta["validation_torque_rmse_nm"])
         table.add_row("held-out torque", f"{values} N m")
-    if tick.get("p50") is not None:
-        table.add_row(
-            "driver, filter, synthesis",
-            f"p50 {tick['p50']:.0f} µs, p99 {tick['p99']:.0f} µs"
-            + (f"; {missed_words(figures)}" if is_live(figures) else ""),
-        )
     table.add_row("model", figures["model"])
     if report:
         table.add_row("report", report)

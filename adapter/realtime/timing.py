@@ -120,12 +120,11 @@ class TimingReport:
             "period": self.period_us,
             "age of a sample when the loop has it": self.age_us,
         }
-        out = []
-        for name, values in rows.items():
-            if values["p50"] is not None:
-                shown = "  ".join(f"{k} {v:.1f}" for k, v in values.items() if v is not None)
-                out.append(f"{name}, µs: {shown}")
-        return out
+        return [
+            f"{name}, µs: {'  '.join(f'{k} {v:.1f}' for k, v in x.items() if v is not None)}"
+            for name, x in rows.items()
+            if x["p50"] is not None
+        ]
 
 
 class Timing:

@@ -173,9 +173,6 @@ def unseen_table(result: GapResult) -> Table | None:
     return Table(heads, body) if body else None
 
 
-TIMES_NOISE = "× noise: in the band that the noise is of, where the joint slides."
-
-
 def error_table(result: GapResult) -> Table:
     """Errors before and after by joint: torque in N m and times its noise, rollouts in mrad."""
     before, after = result.before, result.after
@@ -195,7 +192,7 @@ def error_table(result: GapResult) -> Table:
         heads += ["Before", "After"]
         units += [unit, unit]
     rows = [[name, *(plain(x[j]) for x in columns)] for j, name in enumerate(result.joint_names)]
-    return Table(heads, rows, units, TIMES_NOISE)
+    return Table(heads, rows, units, "× noise: in its band, where the joint slides.")
 
 
 def correction_table(result: GapResult) -> Table | None:

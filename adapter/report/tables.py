@@ -213,15 +213,10 @@ CHANGE_HEADS = ("Seen at", "Load", "Centre of mass")
 CHANGE_UNITS = ("s after the first motion", "kg", "mm, in the last link's frame")
 
 
-def change_rows(data: RunData) -> list[list[str]]:
-    """Changes at the hand with what they brought, under `CHANGE_HEADS`."""
-    changes = data.figures["theta"].get("changes") or []
-    return [load_cells(x["stamp_s"] - data.start_s, x.get("payload") or {}) for x in changes]
-
-
 def changes_table(data: RunData) -> Table | None:
-    """These; None where there were none."""
-    rows = change_rows(data)
+    """Changes at the hand with what they brought; None where there were none."""
+    changes = data.figures["theta"].get("changes") or []
+    rows = [load_cells(x["stamp_s"] - data.start_s, x.get("payload") or {}) for x in changes]
     return Table(CHANGE_HEADS, rows, CHANGE_UNITS) if rows else None
 
 

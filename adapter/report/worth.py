@@ -28,7 +28,7 @@ from adapter.report.tables import (
     CHANGE_UNITS,
     Table,
     by_column,
-    change_rows,
+    changes_table,
     effect_columns,
     load_cells,
 )
@@ -277,7 +277,8 @@ def truth_tables(data: RunData) -> list[Table]:
         for e in entries
         if e["effect"] == "payload"
     ]
-    rows = [*(["learned", *row] for row in change_rows(data)), *loads]
+    found = changes_table(data)
+    rows = [*(["learned", *row] for row in (found.rows if found else ())), *loads]
     return [*tables, *([Table(["", *CHANGE_HEADS], rows, ["", *CHANGE_UNITS])] if rows else [])]
 
 
