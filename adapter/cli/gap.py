@@ -29,6 +29,7 @@ from adapter.gap.workflow import GapSettings, find_gap, names_of
 from adapter.model.model_file import load_model
 from adapter.report.gap_page import render_gap_page
 from adapter.report.html import write_whole
+from adapter.report.servo_page import render_servo_page
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import (
     complain,
@@ -203,8 +204,15 @@ def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list
         complain(refusal)
         return ExitCode.DONE if refusal.kind.is_an_answer else ExitCode.WRONG_USE
     gap.servos.save(target)
-    _write(args, folder, {**servo_words.as_json(gap), "servos_out": str(target)})
+    facts = {**servo_words.as_json(gap), "servos_out": str(target)}
+    page = folder / "report.html"
+    page.unlink(missing_ok=True)  # of an earlier result
+    if not args.no_report:
+        facts["report"] = str(write_whole(page, render_servo_page(gap, str(args.model), target)))
+    _write(args, folder, facts)
     for line in servo_words.lines(gap):
         output.print(Text.from_markup(line), soft_wrap=True)
     say(f"servos {target}")
+    if not args.no_report:
+        show(f"report {page}")
     return 0
