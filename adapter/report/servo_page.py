@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from adapter.gap import servo_words
 from adapter.gap.phrases import shown_unit, who
 from adapter.gap.servo import EFFECTS, ServoFinding, ServoGap
+from adapter.gap.servo_arms import ServoNumber
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.report.gap_panels import fall_drawing, rollout_drawing, worst_window
 from adapter.report.gap_tables import tied
@@ -25,8 +27,15 @@ TITLES = tuple(title for title, _, _ in EFFECTS.values())  # what the table has,
 SLOW_RAD_S, MOSTLY = 0.1, 0.5  # where more than that share of what is left is
 
 
-def render_servo_page(gap: ServoGap, model: str, servos: Path) -> str:
-    """The page as HTML text. `model`: as the command had it; `servos`: the file they are in."""
+def render_servo_page(
+    gap: ServoGap, model: str, servos: Path, beside: Sequence[ServoNumber] = ()
+) -> str:
+    """The page as HTML text.
+
+    Args:
+        model: as the command had it; servos: the file they are in.
+        beside: numbers of this arm and of others of its kind.
+    """
     tiles, joints = _tiles(gap), [f"joint {j + 1}" for j in range(len(gap.joint_names))]
     parts = [x for x in servo_words.headline(gap).split("; ") if not x.startswith(TITLES)]
     panels = []
@@ -52,6 +61,8 @@ def render_servo_page(gap: ServoGap, model: str, servos: Path) -> str:
             "errors": panels,
             "error_table": _errors(gap),
             "moments": _moments(gap),
+            "odd": [capital(text) for number in beside for text in number.sentences()],
+            "arms": _arms(beside),
             "checks": _checks(gap),
             "steps": _steps(gap, model, servos),
             "notes": gap.notes,
@@ -114,6 +125,16 @@ def _errors(gap: ServoGap) -> Table:
     rows.append(["all", DASH, DASH, *(plain(1e3 * x[-1], 3) for x in hand)])
     heads = ["Joint", "Before", "After", "Before", "After"]
     return Table(heads, rows, ["", "mrad", "mrad", "hand, mm", "hand, mm"])
+
+
+def _arms(numbers: Sequence[ServoNumber]) -> Table | None:
+    """A row for each number, a column for each arm; those that differ stand out."""
+    arms = list(dict.fromkeys(arm for number in numbers for arm in number.values))
+    rows = [
+        [capital(x.title), *(tied(x.cell(arm)) + " ◄" * (arm in x.odd) for arm in arms)]
+        for x in numbers
+    ]
+    return Table(["Number", *arms], rows) if rows else None
 
 
 def _moments(gap: ServoGap) -> list[Panel]:
