@@ -167,11 +167,7 @@ class _Writer:
                 q, joint = self.compiled.key_qpos[number], self.compiled.joint
                 values += [float(q[joint(name).qposadr[0]]) for name in steered]
                 self.xml.set(key, "ctrl", number_text([*values, *[0.0] * len(speeds)]))
-        section, lines = self.xml.root.child("actuator"), [*new, *speeds]
-        if section is not None and lines:
-            self.xml.insert(section, "\n".join(lines))
-        elif lines:
-            self.xml.insert(self.xml.root, "\n".join(["<actuator>", *_in(lines), "</actuator>"]))
+        self._add("actuator", [*new, *speeds])
         if speeds:
             self.notes.append(
                 "the servos use the command's speed, which MuJoCo does not derive: give it, rad/s, "
@@ -213,10 +209,8 @@ class _Writer:
         data = mujoco.MjData(compiled)
         mujoco.mj_kinematics(compiled, data)
         link = compiled.body(tree.link_names[floor.link]).id
-        base = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_BODY, tree.base_name)
-        base = max(base, 0)
-        turn = matrix_from_quaternion(data.xquat[base])
-        up = turn @ floor.up
+        base = max(mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_BODY, tree.base_name), 0)
+        up = matrix_from_quaternion(data.xquat[base]) @ floor.up
         place = data.xpos[base] + (floor.height - BALL_M) * up
         anchor = compiled.joint(tree.joint_names[floor.link]).pos
         point = anchor + z_to_axis(model.axis[floor.link]) @ floor.point
@@ -234,16 +228,16 @@ class _Writer:
         push = [-floor.stiffness * (1.0 - YIELDS) * light, 0.0]
         pair: dict[str, Any] = {"geom1": names[0], "geom2": names[1], "condim": 1, "solref": push}
         pair["solimp"] = [YIELDS, YIELDS, 0.001, 0.5, 2.0]
-        section = self.xml.root.child("contact")
-        if section is None:
-            text = "\n".join(["<contact>", *_in([_element("pair", pair)]), "</contact>"])
-            self.xml.insert(self.xml.root, text)
-        else:
-            self.xml.insert(section, _element("pair", pair))
+        self._add("contact", [_element("pair", pair)])
 
-
-def _in(lines: list[str]) -> list[str]:
-    return [f"  {line}" for line in lines]
+    def _add(self, tag: str, lines: list[str]) -> None:
+        """Elements into a section, which may have to be made."""
+        section = self.xml.root.child(tag)
+        if section is not None and lines:
+            self.xml.insert(section, "\n".join(lines))
+        elif lines:
+            inside = (f"  {line}" for line in lines)
+            self.xml.insert(self.xml.root, "\n".join([f"<{tag}>", *inside, f"</{tag}>"]))
 
 
 def _element(tag: str, facts: dict[str, Any]) -> str:

@@ -113,10 +113,6 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 @dataclass(frozen=True)
 class JointPanels:
     """Panels of one joint: clouds of its residual, and its residual and motion over time."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from adapter.gap import servo_words
 from adapter.gap.phrases import shown_unit, who
-from adapter.gap.servo import EFFECTS, ServoFinding, ServoGap
+from adapter.gap.servo import EFFECTS, ServoGap
 from adapter.gap.servo_arms import ServoNumber
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.report.gap_panels import fall_drawing, rollout_drawing, worst_window
@@ -100,20 +100,19 @@ def _found(gap: ServoGap) -> Table | None:
         factor, shown = shown_unit(finding.values[0], unit)
         heads.append(capital(title))
         units.append(shown)
-        columns.append({j: _value(finding, k, factor) for k, j in enumerate(finding.joints)})
+        cells = dict[int, str]()
+        rows = zip(finding.values, finding.std, finding.documented, strict=True)
+        for j, (value, std, documented) in zip(finding.joints, rows, strict=True):
+            known = "" if documented is None else f", not {plain(factor * documented, 3)}"
+            cells[j] = tied(f"{plus_minus(factor * value, factor * std)}{known}")
+        columns.append(cells)
     if not columns:
         return None
-    rows = [
+    table = [
         [f"{j} {name}", *(column.get(j, DASH) for column in columns)]
         for j, name in enumerate(gap.joint_names, start=1)
     ]
-    return Table(heads, rows, units)
-
-
-def _value(finding: ServoFinding, k: int, factor: float) -> str:
-    value, documented = finding.values[k], finding.documented[k]
-    known = "" if documented is None else f", not {plain(factor * documented, 3)}"
-    return tied(f"{plus_minus(factor * value, factor * finding.std[k])}{known}")
+    return Table(heads, table, units)
 
 
 def _errors(gap: ServoGap) -> Table:
