@@ -38,6 +38,7 @@ def render_servo_page(
     """
     tiles, joints = _tiles(gap), [f"joint {j + 1}" for j in range(len(gap.joint_names))]
     parts = [x for x in servo_words.headline(gap).split("; ") if not x.startswith(TITLES)]
+    parts.sort(key=lambda text: not text.startswith("tracking error"))
     panels = []
     for what, factor, unit, (before, after) in (
         ("Tracking error", 1e3, "mrad rms", (gap.before, gap.after)),
@@ -61,7 +62,7 @@ def render_servo_page(
             "errors": panels,
             "error_table": _errors(gap),
             "moments": _moments(gap),
-            "odd": [capital(text) for number in beside for text in number.sentences()],
+            "odd": [text for number in beside for text in number.sentences()],
             "arms": _arms(beside),
             "checks": _checks(gap),
             "steps": _steps(gap, model, servos),

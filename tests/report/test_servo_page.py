@@ -75,6 +75,7 @@ def test_the_page_says_what_was_found_and_what_to_do() -> None:
         "Joint 3, jaw rad", "of c.mcap",
     ):  # fmt: skip
         assert part in said.replace("\u202f", " ").replace("\u00a0", " "), part
+    assert "<h1>Tracking error of the worst joint" in page
     assert said.index("Joint 3, jaw") < said.index("Joint 2, lift") < said.index("Joint 1, pan")
 
 
