@@ -154,6 +154,9 @@ def test_what_cannot_be_written_is_said(dressed: Path, monkeypatch, capsys) -> N
     written = servo_mjcf(FREE, late)
     assert "delay=" not in written.text
     assert "give commands 3.00 ms late" in " ".join(written.notes)
+    assert 'timestep="0.0005" integrator="RK4"' in written.text
+    quick = replace(late, viscous=1e4 * late.viscous)  # too quick for Runge and Kutta
+    assert 'timestep="0.0001" integrator="implicitfast"' in servo_mjcf(FREE, quick).text
     monkeypatch.undo()
     (dressed / "scene.xml").write_text('<mujoco><include file="arm.xml"/></mujoco>')
     words = ["export", str(dressed / "scene.xml"), "--servo", str(dressed / "servo.toml")]
