@@ -164,7 +164,7 @@ def _additions(model: SelfModel, places: Sequence[str], acting: Sequence[Active]
         note = "it ended"
         if active.lasting:
             part = active.effect.export(more, active.joint, active.values)
-            if part is None:
+            if part is None or not any(map(np.any, active.values.values())):
                 continue
             note = part
         name, units = active.effect.name, active.effect.units()

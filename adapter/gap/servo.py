@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from adapter.gap.hand import hand_frame
+from adapter.gap.result import RolloutCurves
 from adapter.gap.servo_fit import (
     ALL_FREE,
     PARAMETERS,
@@ -45,6 +48,7 @@ from adapter.gap.servo_signals import Track, loads, over_ground
 from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.physics.kernels import place_frames
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingFault, RecordingRefused, moving_joints
 from drivers.files.mcap import Log
@@ -61,6 +65,7 @@ DRAWS = 8  # of inertias as wrong as the documentation may be
 OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
+HAND_ROWS = 500  # of a recording, where the way of the hand is told
 ROUGH_STEP_S = 8e-3  # of the first simulations
 # what a limit, a dead band or backlash has to tell of blocks not seen, and its share of what was
 # left: simulated ones explain nearly all of it, on a real arm a wrong one explained a tenth
@@ -107,9 +112,11 @@ class ServoGap:
     Attributes:
         joint_names, model_name, recordings: of the arm, its model and the files.
         findings: by effect; servos: the new model.
-        before, after: (n,) rad, rms tracking error of the documented and of the new servos on what
-            the fit has not seen: recordings held out, or the last third.
+        curves: what the fit has not seen, recordings held out or the last third, by name: measured,
+            and foretold by commands alone, before by the documented and after by the new servos.
         scored: which data these are, in words.
+        hand: the frame at the hand; hand_before, hand_after: (n + 1,) m, rms by which it is off, by
+            each joint's error alone and, last, by all of them.
         scale_open: joints (from 1) whose documented masses do not show the gains' scale.
         ground: what the hand came down on beside what is documented, if anything; touched: for how
             long, s, in each recording that is fitted.
@@ -121,13 +128,25 @@ class ServoGap:
     recordings: tuple[str, ...]
     findings: tuple[ServoFinding, ...]
     servos: ServoModel
-    before: Array
-    after: Array
+    curves: tuple[tuple[str, RolloutCurves], ...]
     scored: str
+    hand: str
+    hand_before: Array
+    hand_after: Array
     scale_open: tuple[int, ...] = ()
     ground: Ground = NO_GROUND
     touched: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def before(self) -> Array:
+        """(n,) rad, rms tracking error of the documented servos, all recordings counting alike."""
+        return _rms([x.before - x.measured for _, x in self.curves])
+
+    @cached_property
+    def after(self) -> Array:
+        """(n,) rad, the same of the new servos."""
+        return _rms([x.after - x.measured for _, x in self.curves])
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +234,11 @@ def explain(
     if ground.root > 0.0 and sum(x > TOUCHED_S for x in touched) < LEAST_TOUCHED:
         servos = replace(servos, ground=NO_GROUND)  # one motion does not tell it in other poses
     progress("foretelling what was held out")
-    before, after, scored = _scored(arm, fits, servos, unseen)
+    curves, scored = _scored(arm, fits, servos, unseen)
+    hand = hand_frame(model)
+    if hand.parent == hand.name:  # nothing rides on the last link, which may be a jaw
+        hand = next((x for x in model.frames[::-1] if x.parent in model.tree.link_names), hand)
+    place = arm.rigid, model.tree.link_names.index(hand.parent), hand.position
     found = _Table(arm)
     for j, fit in enumerate(fits):
         found.add_joint(j, fit)
@@ -228,9 +251,11 @@ def explain(
         recordings=tuple(log.path.name for log in (*logs, *hold_out)),
         findings=found.findings(),
         servos=servos,
-        before=before,
-        after=after,
+        curves=curves,
         scored=scored,
+        hand=hand.name,
+        hand_before=_hand_off(*place, [(x.measured, x.before) for _, x in curves]),
+        hand_after=_hand_off(*place, [(x.measured, x.after) for _, x in curves]),
         scale_open=tuple(found.scale_open),
         ground=ground,
         touched=touched,
@@ -480,30 +505,51 @@ def _limit(tight: Array, kp: Array) -> Array:
 
 def _scored(
     arm: _Arm, fits: Sequence[JointFit], servos: ServoModel, unseen: Sequence[Track]
-) -> tuple[Array, Array, str]:
-    """Tracking errors (n,) before and after, on what the fit has not seen; and what that is."""
-    if unseen:
-        scored = f"{len(unseen)} recordings held out" if len(unseen) > 1 else "held out recording"
-        before, after = (
-            np.sqrt(np.mean([s.tracking_error(t, arm.rigid) ** 2 for t in unseen], axis=0))
-            for s in (arm.documented, servos)
-        )
-        return before, after, scored
-    fitted = []
-    for fit in fits:
-        pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
-        rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
-        fitted.append(fit_joint(replace(fit.task, rows=rows), fit.freedom, fit.x))
-    part = _servos(arm, fitted) if fitted else servos
-    errors = []
-    for s in (arm.documented, part):
-        squares = []
-        for track in arm.tracks:
-            left = track.left(s.follow(track, arm.rigid))
-            last = track.stamp_s >= FITTED_SHARE * track.stamp_s[-1]
-            squares.append(np.mean(left[last] ** 2, axis=0))
-        errors.append(np.sqrt(np.mean(squares, axis=0)))
-    return errors[0], errors[1], "last third, servos fitted before it"
+) -> tuple[tuple[tuple[str, RolloutCurves], ...], str]:
+    """Motions that the fit has not seen, by name, measured and foretold; and what they are."""
+    tracks, told = unseen, f"{len(unseen)} recordings held out"
+    if len(unseen) == 1:
+        told = "held out recording"
+    if not unseen:
+        tracks, told, fitted = arm.tracks, "last third, servos fitted before it", []
+        for fit in fits:
+            pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
+            rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
+            fitted.append(fit_joint(replace(fit.task, rows=rows), fit.freedom, fit.x))
+        servos = _servos(arm, fitted) if fitted else servos
+    found = []
+    for t in tracks:
+        take = t.judged if unseen else t.stamp_s >= FITTED_SHARE * t.stamp_s[-1]
+        ways = (t.q - t.left(s.follow(t, arm.rigid)) for s in (arm.documented, servos))
+        found.append((t.name, RolloutCurves(*(x[take] for x in (t.stamp_s, t.q, *ways)))))
+    return tuple(found), told
+
+
+def _rms(left: Sequence[Array]) -> Array:
+    """Root mean square over the rows of tables that count alike."""
+    return np.asarray(np.sqrt(np.mean([np.mean(x**2, axis=0) for x in left], axis=0)))
+
+
+def _hand_off(
+    arm: RigidArm, link: int, point: Array, pairs: Sequence[tuple[Array, Array]]
+) -> Array:
+    """(n + 1,) m, rms way of a point between two motions (m, n): by each joint alone, by all."""
+    R, o, left = np.empty((arm.n, 3, 3)), np.empty((arm.n, 3)), []
+
+    def at(q: Array) -> Array:
+        place_frames(arm.frames, q, R, o)
+        return np.asarray(o[link] + R[link] @ point)
+
+    for one, other in pairs:
+        ways = []
+        for k in range(0, len(one), max(len(one) // HAND_ROWS, 1)):
+            moved = np.tile(one[k], (arm.n + 1, 1))
+            np.fill_diagonal(moved, other[k])
+            moved[-1] = other[k]
+            here = at(one[k])
+            ways.append([np.linalg.norm(at(q) - here) for q in moved])
+        left.append(np.array(ways))
+    return _rms(left)
 
 
 class _Table:

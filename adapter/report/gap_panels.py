@@ -113,10 +113,6 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 @dataclass(frozen=True)
 class JointPanels:
     """Panels of one joint: clouds of its residual, and its residual and motion over time."""
@@ -282,7 +278,9 @@ def _motion(result: GapResult, j: int) -> Panel:
     """Forward simulation of a joint against data; its torque where nothing was simulated."""
     rollout = next((r for r in result.rollouts if np.isfinite(r.before[:, j]).any()), None)
     if rollout is not None:
-        return _rollout(rollout, j)
+        start, stop = worst_window(rollout.t, rollout.before[:, j] - rollout.measured[:, j])
+        note = "position, restarted from the data every 0.5 s; below, how far it is off"
+        return rollout_drawing(rollout, j, start, stop).panel("Forward simulation", "rad", note)
     curves = result.curves[0]
     drawing = Drawing("half")
     ax, tau = drawing.axes[0], curves.tau[:, j]
@@ -293,18 +291,18 @@ def _motion(result: GapResult, j: int) -> Panel:
     return drawing.panel("Torque, measured and predicted", "N m", f"of {curves.recording}")
 
 
-def _rollout(rollout: RolloutCurves, j: int) -> Panel:
+def rollout_drawing(rollout: RolloutCurves, j: int, start: float, stop: float) -> Drawing:
+    """Motion of a joint, measured and simulated, from a time to another, and how far it is off."""
     drawing = Drawing("half", rows=(1.5, 1.0), stretch=1.0)
     above, below = drawing.axes
-    start, stop = _window(rollout, j)
     keep = (rollout.t >= start) & (rollout.t <= stop)
     t, measured = rollout.t[keep], rollout.measured[keep, j]
-    above.plot(t, measured, color=INK, linewidth=2.6, alpha=0.3)
+    above.plot(*thin(t, measured), color=INK, linewidth=2.6, alpha=0.3)
     worst = 0.0
     for simulated, color in ((rollout.before, GOAL), (rollout.after, ACCENT)):
         path = simulated[keep, j]
-        above.plot(t, path, color=color, linewidth=1.0)
-        below.plot(t, 1e3 * (path - measured), color=color, linewidth=0.9)
+        above.plot(*thin(t, path), color=color, linewidth=1.0)
+        below.plot(*thin(t, 1e3 * (path - measured)), color=color, linewidth=0.9)
         error = 1e3 * np.abs(path - measured)
         worst = max(worst, float(np.nanmax(error)) if np.isfinite(error).any() else 0.0)
     below.axhline(0.0, color=MUTED, linewidth=0.6)
@@ -318,16 +316,14 @@ def _rollout(rollout: RolloutCurves, j: int) -> Panel:
     )
     below.set_xlim(start, stop)
     time_axis(drawing, "time, s")
-    note = "position, restarted from the data every 0.5 s; below, how far it is off"
-    return drawing.panel("Forward simulation", "rad", note)
+    return drawing
 
 
-def _window(rollout: RolloutCurves, j: int) -> tuple[float, float]:
-    """The stretch of at most 10 s in which the old model is furthest off."""
-    t = rollout.t
+def worst_window(t: Array, left: Array) -> tuple[float, float]:
+    """The stretch of at most 10 s in which most is left of a joint's motion."""
     if t[-1] - t[0] <= SHOWN_ROLLOUT_S:
         return float(t[0]), float(t[-1])
-    error = np.nan_to_num(rollout.before[:, j] - rollout.measured[:, j]) ** 2
+    error = np.nan_to_num(left) ** 2
     starts = np.arange(t[0], t[-1] - SHOWN_ROLLOUT_S + 1e-9, 0.5)
     sums = [error[(t >= s) & (t <= s + SHOWN_ROLLOUT_S)].sum() for s in starts]
     start = float(starts[int(np.argmax(sums))])

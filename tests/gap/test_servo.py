@@ -203,11 +203,21 @@ def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -
     asked = [*words, "--hold-out", str(unseen), "--out", str(tmp_path / "one")]
     assert main(asked) == 0
     said = capsys.readouterr().out
-    for part in ("position gain", "velocity gain", "ms late", "Coulomb", "viscous", "inertia"):
+    for part in (
+        "position gain",
+        "velocity gain",
+        "ms late",
+        "Coulomb",
+        "viscous",
+        "inertia",
+        "at the hand",
+    ):
         assert part in said
     figures = json.loads((tmp_path / "one" / "gap.json").read_text())
     assert max(figures["after"]["tracking_rmse_rad"]) < 1e-4
     assert {f["effect"] for f in figures["findings"]} == {e for e, _ in arm.expected}
+    assert (tmp_path / "one" / "report.html").read_text().count("<svg") == 8
+    assert figures["after"]["hand_rmse_m"] < 1e-4 < figures["before"]["hand_rmse_m"]
     servos = str(tmp_path / "one" / "servo.toml")
     assert figures["servos_out"] == servos
     again = ["gap", str(unseen), "--model", "panda", "--quiet", "--servo", servos]
