@@ -1,4 +1,4 @@
-"""Torque limits, dead bands and backlash of position-controlled arms without torque: are they named?
+"""Torque limits, dead bands and backlash of position-controlled arms: are they named?
 
     python tests/benchmarks/servo_limit_trials.py KIND [--seeds 12] [--first 0]
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,8 @@ def drawn(kind: str, seed: int) -> tuple[PositionArm, list[int]]:
         sizes = 10.0 ** rng.uniform(np.log10(2e-3), most, arm.truth.n)
     values = np.array(getattr(arm.servos, kind))
     values[joints] = sizes[joints]
-    return replace(arm, servos=replace(arm.servos, **{kind: values})), (joints + 1).tolist()
+    changed: dict[str, Any] = {kind: values}
+    return replace(arm, servos=replace(arm.servos, **changed)), (joints + 1).tolist()
 
 
 def main() -> None:
