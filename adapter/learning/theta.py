@@ -171,6 +171,7 @@ class Theta:
         self.hand = slice(first, first + 10)
         self.spare = slice(self._effects_from - 10, self._effects_from)
         self._parent = np.array(tree.parent, dtype=np.int64)
+        self._slides = np.array(tree.slides)
         widths = [len(effect.shapes) or 1 for effect in self.effects]
         self.columns = sum(widths)
         ends = np.cumsum(widths, dtype=int).tolist()
@@ -278,7 +279,7 @@ class Theta:
     def _absorb(
         self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
     ) -> Array:
-        columns, placed = self.effect_columns(table), (self._parent, *frames)
+        columns, placed = self.effect_columns(table), (self._parent, *frames, self._slides)
         sums = tuple(into), self._forgetting, weight, self.rests
         return absorb(placed, self._rows, self._given, table, columns, sums)
 
@@ -316,7 +317,7 @@ class Theta:
         counts = self.moments.counts
         weighing = counts, self.noise_gain, self.floor, self.floor_count, self.model_variance
         return (
-            (self._parent, *frames),
+            (self._parent, *frames, self._slides),
             self._rows,
             self._given,
             into,

@@ -39,7 +39,7 @@ class RigidArm:
     def of(cls, model: SelfModel) -> RigidArm:
         """The rigid part of a self model with its tool."""
         theta = np.ascontiguousarray(model.theta_with_tool()[-model.tree.n :])
-        return cls(frames_of(model.tree.parent, model.lam), np.array(model.gravity), theta)
+        return cls(frames_of(model.tree, model.lam), np.array(model.gravity), theta)
 
     @property
     def n(self) -> int:

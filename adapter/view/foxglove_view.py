@@ -32,7 +32,7 @@ from adapter.effects.robots import to_urdf
 from adapter.errors import MeansError, UsageError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.inertia import PARAMETERS
-from adapter.model.spatial import Array, matrix_from_zxz, quaternion_from_matrix, rot_z
+from adapter.model.spatial import Array, at_joints, matrix_from_zxz, quaternion_from_matrix
 from adapter.realtime.run_messages import table_fields, wrench_fields, xyz
 from adapter.view.now import KnownRun, Now, untold
 from adapter.view.server import HOST
@@ -195,7 +195,8 @@ class FoxgloveView:
             arms[LEARNED] = now.frames.R, now.frames.p
         for prefix, (R, p) in arms.items():
             names = [prefix + name for name in (*tree.link_names, tree.base_name)]  # BASE: the last
-            found.append(([names[i] for i in tree.parent], names[:-1], R @ rot_z(now.q), p))
+            placed = at_joints(R, p, now.q, tree.slides)
+            found.append(([names[i] for i in tree.parent], names[:-1], *placed))
         return [
             {
                 "header": header(now.stamp_ns, parent),
