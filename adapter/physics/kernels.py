@@ -319,9 +319,16 @@ def axis_line(R, o, slides):
     Of one that `slides` [z, 0]: its force is the part of the wrench's force along z.
     """
     x, y, z = R[0, 2], R[1, 2], R[2, 2]
-    if slides:
-        return x, y, z, 0.0, 0.0, 0.0
-    return o[1] * z - o[2] * y, o[2] * x - o[0] * z, o[0] * y - o[1] * x, x, y, z
+    a, b, c = o[1] * z - o[2] * y, o[2] * x - o[0] * z, o[0] * y - o[1] * x
+    slide, turn = (1.0, 0.0) if slides else (0.0, 1.0)  # no branch: what calls it stays vectorised
+    return (
+        slide * x + turn * a,
+        slide * y + turn * b,
+        slide * z + turn * c,
+        turn * x,
+        turn * y,
+        turn * z,
+    )
 
 
 @jit
