@@ -97,7 +97,7 @@ class Information:
         extra = self._columns if self._effects else None
         self.basis = base_parameters(model.tree, model.lam, gravity, extra=extra).basis
         self._inertial = base_parameters(model.tree, model.lam, gravity).basis
-        own = [np.full(n, effect.learned_std) for effect in self._effects]
+        own = [x.learned_std * x.drums(model.tree.slides) for x in self._effects]
         self.size = np.concatenate([np.tile(BODY_SIZE, n), *own])
         scaled = self.basis / (BELIEF * self.size[:, None])
         self.prior: Array = scaled.T @ scaled

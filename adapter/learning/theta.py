@@ -144,6 +144,7 @@ class Theta:
         believed: (e, n) values of the effects' parameters and their standard deviations before any
             torque, from a model; NaN where it says nothing, which is held for absent until data
             show it.
+        drums: (e, n) times which that holds, of joints of which some slide.
         effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
             body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
@@ -186,6 +187,7 @@ class Theta:
         self.count, self.weight = 0.0, 1.0
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
+        self.drums = np.array([x.drums(tree.slides) for x in self.effects]).reshape(e, n)
         nothing: Array = np.full((e, n), np.nan)
         told = believed(known.effects, settings.effects, n)
         self.believed = told or (nothing, nothing)
@@ -206,7 +208,7 @@ class Theta:
         self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
         self.rests = np.ones(n)
-        self._weigh_rests(np.repeat(np.square(self.effect_spread), n))
+        self._weigh_rests(np.square(self.effect_spread[:, None] * self.drums).ravel())
 
     @property
     def _effects_from(self) -> int:
@@ -217,7 +219,7 @@ class Theta:
         std = np.full(self.P, np.inf)
         std[: self.spare.start] = np.outer(self.body_spread[:-1], PRIOR_STD).ravel()
         told = np.isfinite(self.believed[0])
-        spread = np.where(told, self.believed[1], self.effect_spread[:, None])
+        spread = np.where(told, self.believed[1], self.effect_spread[:, None] * self.drums)
         std[self._effects_from :] = spread.ravel()
         mean = np.zeros(self.P)
         mean[: self.spare.start] = np.tile(neutral_body(), self.bodies - 1)
@@ -505,9 +507,9 @@ class Theta:
         if not self.effects:
             return
         n = self.tree.n
-        variance = diagonal[self._effects_from :].reshape(-1, n)
+        variance = diagonal[self._effects_from :].reshape(-1, n) / self.drums**2
         widest = np.array([effect.learned_std for effect in self.effects])
-        values, free = self.effect_values, np.isnan(self.believed[0])
+        values, free = self.effect_values / self.drums, np.isnan(self.believed[0])
         shares = [
             self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
         ]
@@ -523,6 +525,7 @@ class Theta:
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(self._effects_from, self.P)
         change = np.repeat(1.0 / spread**2 - 1.0 / self.effect_spread**2, n)
+        change /= self.drums.ravel() ** 2
         self.prior[at, at] += np.where(free.ravel(), change, 0.0)
         self.effect_spread[:] = spread
         if self.settings.model_error is None:
@@ -823,7 +826,7 @@ def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
     share = np.ones(place.shape)
     for j, size in enumerate(sizes):  # nothing is known of rates at first
         share[j, size - len(owner) : size] = [not effects[k].by_rates for k in owner]
-    steps = np.repeat([effect.step for effect in effects], n)
+    steps = np.array([effect.step * effect.drums(tree.slides) for effect in effects]).ravel()
     return Rows(
         slot,
         sizes,
