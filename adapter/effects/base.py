@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
+from adapter.effects.by_joint import DRUM_M, ByJoint, JointSignals, smooth_sign
 from adapter.effects.phrases import DecidingExperiment, Phrase
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
@@ -51,10 +51,6 @@ JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 def with_squares(unit: str) -> str:
     """A unit of a file as people write it: kg m² for kg m2."""
     return unit.translate(str.maketrans("234", "²³⁴"))
-
-
-# m: a joint that slides is taken to have what one that turns a drum of this radius has
-DRUM_M = 0.1
 
 
 def of_sliding(unit: str) -> str:
@@ -155,7 +151,12 @@ class Motion:
     @property
     def direction(self) -> Array:
         """sign(dq) (m, n), smoothed around rest."""
-        return smooth_sign(self.dq)
+        return smooth_sign(self.dq, drum=self.drums)
+
+    @property
+    def drums(self) -> Array:
+        """(n,) DRUM_M of joints that slide, one of others."""
+        return np.where(self.arm.slides, DRUM_M, 1.0)
 
     def moved(self, joint: int, q: Array, dq: Array, ddq: Array) -> Motion:
         """The same with the joint (from 0) displaced by q, dq, ddq (m,)."""
@@ -511,7 +512,8 @@ class JointTorque(TorqueEffect):
         """The law on one joint."""
         q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
         numbers = {key: x if np.ndim(x) else float(x) for key, x in values.items()}
-        return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), numbers))
+        at = JointSignals(q, dq, ddq, own, drum=float(motion.drums[joint]))
+        return on_joint(motion, joint, self.law(at, numbers))
 
     def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The law itself."""
