@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from adapter.effects.base import LearnedEffect
+from adapter.effects.base import LearnedEffect, of_sliding
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import effects_by_name
 from adapter.model.inertia import PARAMETERS, UNITS
@@ -182,5 +182,5 @@ class Information:
             units += UNITS
         for effect in self._effects:
             names += [f"{joint} {effect.key}" for joint in tree.joint_names]
-            units += [effect.unit] * tree.n
+            units += [of_sliding(effect.unit) if slides else effect.unit for slides in tree.slides]
         return tuple(names), tuple(units)
