@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -13,11 +14,14 @@ import pytest
 
 import adapter
 from adapter.gap.load import find_load
+from adapter.gap.servo import going_on
+from adapter.gap.servo_kernels import Ground, above_ground
 from adapter.gap.words import console_summary, headline
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
+from adapter.physics.kernels import frames_of
 from adapter.signals.matching import present
-from drivers.files.mcap import Log
+from drivers.files.mcap import Commands, Log
 from tests.helpers.robot_models import machine_urdf, pin_model, read_quietly
 
 COULOMB_N, VISCOUS_N_S, LOAD_KG = 12.0, 25.0, 0.8
@@ -102,3 +106,29 @@ def test_fingers_in_a_recording_are_spoken_of_and_free_where_asked_for() -> None
     left = (log.tau - found)[5:-5, 4]
     friction = COULOMB_N * np.sign(log.dq[5:-5, 4]) + VISCOUS_N_S * log.dq[5:-5, 4]
     assert np.corrcoef(left, friction)[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("robot", ["rail", "scara", "gantry"])
+def test_a_hand_rises_with_its_slides_as_differences_say(robot: str) -> None:
+    model, rng = read_quietly(machine_urdf(robot)), np.random.default_rng(3)
+    frames, n = frames_of(model.tree, model.lam), model.tree.n
+    ground = Ground(n - 1, rng.normal(size=3), np.array([0.1, 0.2, 0.97]), 0.3, 2.0)
+    q, lift, unused = rng.normal(size=n), np.empty(n), np.empty(n)
+    above_ground(frames, ground, q, lift)
+    for j, step in enumerate(1e-6 * np.eye(n)):
+        ends = [above_ground(frames, ground, q + sign * step, unused) for sign in (1.0, -1.0)]
+        assert lift[j] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-7)
+
+
+def test_positions_and_commands_told_within_one_turn_go_on_in_the_servos_door() -> None:
+    model = read_quietly(machine_urdf("scara"))
+    t = np.arange(0.0, 5.0, 0.01)
+    q = np.column_stack([3.0 + 0.6 * np.sin(t + k) for k in range(4)])
+    orders = Commands(np.arange(500) * 10_000_000, np.full_like(q, np.nan), q + 0.01)
+    log = Log(Path("wrapped"), model.tree.joint_names, orders.stamp_ns, q, q, q, commands=orders)
+    turns = np.where(model.tree.slides, q, (q + np.pi) % (2.0 * np.pi) - np.pi)
+    assert np.abs(np.diff(turns, axis=0)).max() > 6.0
+    found = going_on(replace(log, q=turns, commands=replace(orders, q=turns + 0.01)), model)
+    assert found.commands is not None
+    np.testing.assert_allclose(np.diff(found.q, axis=0), np.diff(q, axis=0), atol=1e-9)
+    np.testing.assert_allclose(found.commands.q - found.q, 0.01, atol=1e-9)
