@@ -51,6 +51,7 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import place_frames
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingFault, RecordingRefused, moving_joints
+from adapter.screening.timing import unwrapped
 from drivers.files.mcap import Log
 
 ROUNDS = 2  # in which the load follows from the arm's simulated motion
@@ -211,6 +212,7 @@ def explain(
         RecordingRefused: too short, or nothing moves. DriverError: it lacks a joint.
     """
     names = model.tree.joint_names
+    logs, hold_out = ([going_on(log, model) for log in x] for x in (logs, hold_out))
     documented = documented or ServoModel.ideal(names)
     tracks = tuple(_track(log, names) for log in logs)
     unseen = tuple(_track(log, names) for log in hold_out)
@@ -261,6 +263,18 @@ def explain(
         touched=touched,
         notes=(*(w for log in logs for w in log.warnings), *found.notes),
     )
+
+
+def going_on(log: Log, model: SelfModel) -> Log:
+    """A recording with positions and commands of joints that were told within one turn going on."""
+    log, own = log.select(model.tree.joint_names), model.limits
+    q, _ = unwrapped(log.q, own.lower, own.upper)
+    if log.commands is None or log.commands.q is None or not len(log.commands.q):
+        return replace(log, q=q)
+    goal, _ = unwrapped(log.commands.q, own.lower, own.upper)
+    apart = np.nanmedian(goal, axis=0) - np.nanmedian(q, axis=0)
+    turns = np.where(model.tree.slides, 0.0, np.round(apart / (2.0 * np.pi)))
+    return replace(log, q=q, commands=replace(log.commands, q=goal - 2.0 * np.pi * turns))
 
 
 def _track(log: Log, names: tuple[str, ...]) -> Track:

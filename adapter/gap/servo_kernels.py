@@ -89,7 +89,7 @@ def above_ground(frames, ground, q, lift):
 
     Args:
         frames: `Frames`; ground: `Ground`; q: (n,) rad.
-        lift: (n,) what it rises by per rad of each joint, times the same, filled.
+        lift: (n,) what it rises by per rad (or m) of each joint, times the same, filled.
     """
     n = q.shape[0]
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
@@ -105,6 +105,8 @@ def above_ground(frames, ground, q, lift):
         u, v, w = x[0] - o[j, 0], x[1] - o[j, 1], x[2] - o[j, 2]
         a, b, c = R[j, 0, 2], R[j, 1, 2], R[j, 2, 2]
         risen = up[0] * (b * w - c * v) + up[1] * (c * u - a * w) + up[2] * (a * v - b * u)
+        if frames.slides[j]:
+            risen = up[0] * a + up[1] * b + up[2] * c
         lift[j] = ground.root * risen
         j = frames.parent[j]
     return ground.root * (up[0] * x[0] + up[1] * x[1] + up[2] * x[2] - ground.height)

@@ -21,11 +21,11 @@ from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import (
     Array,
+    at_joints,
     log_rotation,
     matrix_from_zxz,
     quaternion_from_matrix,
     quaternion_product,
-    rot_z,
     z_to_axis,
 )
 from adapter.model.tree import BASE
@@ -111,16 +111,19 @@ class ArmFrames:
         half_turn = quaternion_product(quaternion_product(left, about_z), right)
         self._unturned, self._half_turn = quaternion_product(left, right), half_turn
         self._p = np.einsum("jab,jb->ja", before, p)
+        slides = np.array(self._tree.slides)
+        self._along = np.einsum("jab,jb->ja", before, R0[:, :, 2]) * slides[:, None]
+        self._half = 0.5 * ~slides
 
     def rows(self, q: Array) -> Array:
-        """(n, 7) of every link in its parent at joint angles q (n,) rad."""
-        c, s = np.cos(0.5 * q)[:, None], np.sin(0.5 * q)[:, None]
+        """(n, 7) of every link in its parent at joint angles q (n,) rad, or m."""
+        c, s = np.cos(self._half * q)[:, None], np.sin(self._half * q)[:, None]
         turned = c * self._unturned + s * self._half_turn  # a product is linear in its factors
-        return _rows(self._p, turned)
+        return _rows(self._p + self._along * q[:, None], turned)
 
     def orientation_of_last(self, q: Array) -> Array:
         """(3, 3) of the last link's frame in the base's."""
-        R, turned = np.eye(3), self._R0 @ rot_z(q)
+        R, turned = np.eye(3), at_joints(self._R0, self._p, q, self._tree.slides)[0]
         for j in self._tree.path_to(self._tree.n - 1):
             R = R @ turned[j]
         return np.asarray(R @ self._axes[-1].T)

@@ -60,14 +60,16 @@ def error_panels(result: GapResult) -> list[Panel]:
         drawing = fall_drawing(
             before.torque_rmse_nm, after.torque_rmse_nm, result.noise_floor_nm, result.joint_names
         )
-        panels.append(drawing.panel("Torque error by joint", "N m rms", "inverse dynamics"))
+        panels.append(
+            drawing.panel("Torque error by joint", result.unit("N m rms"), "inverse dynamics")
+        )
     if before.rollout_rmse_rad is not None and _any(before.rollout_rmse_rad):
         rollout = after.rollout_rmse_rad
         end = np.full(len(before.rollout_rmse_rad), np.nan) if rollout is None else rollout
         drawing = fall_drawing(1e3 * before.rollout_rmse_rad, 1e3 * end, None, result.joint_names)
         by = f" by {result.simulator}" if result.simulator else ""
         note = f"forward simulation{by}, restarted from the data every 0.5 s"
-        panels.append(drawing.panel("Position error by joint", "mrad rms", note))
+        panels.append(drawing.panel("Position error by joint", result.unit("mrad rms"), note))
     return panels
 
 
@@ -152,11 +154,15 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
         clouds = []
         for key, title, label in SIGNATURES:
             x = np.concatenate([getattr(c, key)[:, j] for c in result.curves])
+            named, _, unit = label.rpartition(", ")
+            label = f"{named}, {result.unit(unit, j)}"
             cloud = _clouds(result, j, x, ("before", "after"), label)
             laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
             for finding in laws:
                 _law(cloud.axes[0], finding)
-            clouds.append(cloud.panel(title, "N m", ", ".join(f.title for f in laws)))
+            clouds.append(
+                cloud.panel(title, result.unit("N m", j), ", ".join(f.title for f in laws))
+            )
         times = [_over_time(result, j), _motion(result, j)]
         why = [result.joint_names[j]]
         said = [
@@ -264,7 +270,7 @@ def _over_time(result: GapResult, j: int) -> Panel:
     ax.plot(*_line(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
     ax.plot(*_line(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
     time_axis(drawing, "time, s")
-    return drawing.panel("Over time", "N m", f"of {curves.recording}")
+    return drawing.panel("Over time", result.unit("N m", j), f"of {curves.recording}")
 
 
 def _line(t: Array, y: Array) -> tuple[Array, Array]:
@@ -288,7 +294,9 @@ def _motion(result: GapResult, j: int) -> Panel:
     for left, color in ((curves.before, GOAL), (curves.after, ACCENT)):
         ax.plot(*_line(curves.t, tau - left[:, j]), color=color, linewidth=0.9)
     time_axis(drawing, "time, s")
-    return drawing.panel("Torque, measured and predicted", "N m", f"of {curves.recording}")
+    return drawing.panel(
+        "Torque, measured and predicted", result.unit("N m", j), f"of {curves.recording}"
+    )
 
 
 def rollout_drawing(rollout: RolloutCurves, j: int, start: float, stop: float) -> Drawing:
@@ -340,8 +348,9 @@ def unexplained_panels(result: GapResult) -> list[Panel]:
             name, x = "t", np.concatenate([c.t for c in result.curves])
         label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
         drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
-        note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
-        panels.append(drawing.panel(f"Left on joint {item.joint}", "N m", note))
+        unit = result.unit("N m", item.joint - 1)
+        note = f"{plain(item.rmse_nm, 2)} {unit} rms, noise {plain(item.noise_floor_nm, 2)} {unit}"
+        panels.append(drawing.panel(f"Left on joint {item.joint}", unit, note))
     return panels
 
 

@@ -168,7 +168,8 @@ def error_table(result: GapResult) -> Table:
     """Errors before and after by joint: torque in N m and times its noise, rollouts in mrad."""
     before, after = result.before, result.after
     heads = ["Joint", "Noise", *["Before", "After"] * 2]
-    units = ["", "N m", *["torque, N m"] * 2, *["× noise"] * 2]
+    own = result.unit("N m")
+    units = ["", own, *[f"torque, {own}"] * 2, *["× noise"] * 2]
     decimals = [3, 3, 3, 1, 1]
     noise = np.asarray(result.noise_floor_nm, dtype=float)
     floor = np.where(noise > 0.0, noise, np.nan)
@@ -189,7 +190,7 @@ def error_table(result: GapResult) -> Table:
         nothing = np.full(len(noise), np.nan)
         columns += [nothing if x is None else factor * np.asarray(x, dtype=float) for x in pair]
         heads += ["Before", "After"]
-        units += [unit, unit]
+        units += [result.unit(unit)] * 2
         decimals += [digits, digits]
     rows = [
         [

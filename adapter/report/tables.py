@@ -125,13 +125,14 @@ def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
         for key, value in active.values.items():
             if np.ndim(value) or joints[0] < 0:
                 continue
-            given = effect.units()[key]
+            slides = active.joint >= 0 and data.model.tree.slides[active.joint]
+            given = effect.units(slides)[key]
             factor, unit = SHOWN_UNITS.get(given, (1.0, given))
             head = effect.name.replace("_", " ").capitalize()
             column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * data.n)
             std = active.std.get(key)
             shown = "not shown"
-            if is_shown(effect.name, key, std):
+            if is_shown(effect.name, key, std, slides):
                 shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown
