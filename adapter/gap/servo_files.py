@@ -13,6 +13,7 @@ import numpy as np
 
 from adapter.effects.robots import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
+from adapter.gap.phrases import numbered
 from adapter.gap.servo_model import ServoModel
 from adapter.model.mjcf_drives import Drives, Floor, with_drives
 from adapter.model.self_model import SelfModel
@@ -47,7 +48,7 @@ def drives_of(servos: ServoModel, model: SelfModel) -> Drives:
     return Drives(
         servos.position_gain,
         servos.velocity_gain,
-        np.full(model.tree.n, np.inf),
+        servos.torque_limit,
         servos.feeds_speed,
         damping / (own_inertia(model) + servos.armature),
         servos.delay_s,
@@ -75,7 +76,16 @@ def servo_mjcf(
     written = robot_mjcf(with_servos(model, servos), onto, alone)
     file = None if written.onto is None else Path(written.onto)
     text, notes = with_drives(written.text, model, drives_of(servos, model), file)
-    return replace(written, text=text, notes=(*written.notes, *notes))
+    lacks = [
+        f"the {what} of joint {numbered((np.flatnonzero(sizes) + 1).tolist())} is not in it: no "
+        "field of MuJoCo's holds it; our own simulation has it"
+        for what, sizes in (
+            ("dead band", servos.dead_band),
+            ("backlash", servos.backlash),
+        )
+        if sizes.any()
+    ]
+    return replace(written, text=text, notes=(*written.notes, *notes, *lacks))
 
 
 def servo_urdf(

@@ -20,6 +20,7 @@ def followed(model: mujoco.MjModel, log: Log, start: Array) -> Array:
         start: (2, n) q, dq at the first stamp.
     """
     data, names, orders = mujoco.MjData(model), log.joint_names, log.commands
+    assert orders is not None and orders.q is not None
     at = [int(model.joint(name).qposadr[0]) for name in names]
     data.qpos[at] = start[0]
     data.qvel[[int(model.joint(name).dofadr[0]) for name in names]] = start[1]
