@@ -46,3 +46,30 @@ class Address:
             if key not in known:
                 raise DriverError(f"'{address}': no option '{key}'; {choices(key, known)}")
         return cls(parts.scheme, host, int(tail) if tail else None, options)
+
+    def flag(self, key: str, default: bool = False) -> bool:
+        """An option that is 0 or 1. Raises DriverError."""
+        text = self.options.get(key, str(int(default)))
+        if text not in ("0", "1"):
+            raise DriverError(f"option {key} is 0 or 1, not '{text}'; write {key}=1 or {key}=0")
+        return text == "1"
+
+    def number(self, key: str, default: float, low: float, high: float) -> float:
+        """An option as a number from low to high, a whole one where these are.
+
+        Raises DriverError.
+        """
+        return number_of(key, self.options.get(key, str(default)), low, high)
+
+
+def number_of(key: str, text: str, low: float, high: float) -> float:
+    """As `Address.number`, of a text."""
+    whole = isinstance(low, int)
+    try:
+        value = int(text) if whole else float(text)
+    except ValueError:
+        value = low - 1
+    if not low <= value <= high:
+        kind = "whole number" if whole else "number"
+        raise DriverError(f"option {key} is a {kind} from {low} to {high}, not '{text}'")
+    return value

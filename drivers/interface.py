@@ -124,6 +124,15 @@ class Intake:
         return {**told, "refused": dict(self.refused), "commands": commands}
 
 
+def checked_torques(tau: Array, n: int) -> Array:
+    """The torques of a command as float64. Raises DriverError for anything but n finite numbers."""
+    wanted = np.asarray(tau, dtype=np.float64)
+    if wanted.shape != (n,) or not np.isfinite(wanted).all():
+        said = str(tau).replace("\n", " ")
+        raise DriverError(f"a command is {n} finite torques in N m, got {said}; nothing was sent")
+    return wanted
+
+
 class Driver(Protocol):
     """A source of samples and, where it can move, a sink of torque commands.
 

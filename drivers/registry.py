@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl, urlsplit
 
 from drivers.errors import DriverError, choices
 
@@ -23,11 +24,7 @@ HARDWARE = {
     "can": ".damiao.arm:DamiaoArm",
     "ros2": ".ros2.arm:Ros2Arm",
 }
-COUNT = {
-    "fci": ".fci.arm:joint_count",
-    "can": ".damiao.settings:joint_count",
-    "ros2": ".ros2.settings:joint_count",
-}
+FRANKA_JOINTS = 7
 NAMELESS = ("can", "ros2")  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
 OWN = ".own:open_own"  # takes the same
@@ -93,8 +90,13 @@ def open_driver(
 
 def joint_count(address: str) -> int | None:
     """Number of joints of an arm that tells no names; None where nothing says it."""
-    scheme, _ = split_address(address)
-    return None if scheme not in COUNT else _load(COUNT[scheme])(address)
+    scheme, rest = split_address(address)
+    if scheme == "fci":
+        return FRANKA_JOINTS
+    told = dict(parse_qsl(urlsplit(rest).query)).get("joints", "")  # can: a number; ros2: names
+    if scheme not in NAMELESS or not told:
+        return None
+    return int(told) if told.isdecimal() else len([name for name in told.split(",") if name])
 
 
 def _load(target: str) -> Callable[..., Any]:

@@ -146,7 +146,9 @@ def _effect_lines(model: SelfModel) -> list[str]:
             if np.ndim(value) == 0:
                 name, std = str(entry["effect"]), (entry.get("std") or {}).get(key)
                 at = found.setdefault((name.replace("_", " "), key, str(entry["units"][key])), {})
-                said = plus_minus(float(value), std) if is_shown(name, key, std) else "not shown"
+                slides = any(model.tree.slides[j - 1] for j in entry["joints"])
+                shown = is_shown(name, key, std, slides)
+                said = plus_minus(float(value), std) if shown else "not shown"
                 at |= dict.fromkeys(entry["joints"] or [0], said)
     lines = []
     for (name, key, unit), at in found.items():

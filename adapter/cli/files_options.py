@@ -100,10 +100,14 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Write a model as URDF or MJCF. Onto the robot's file (INPUT, or by default the one that "
         "the model came from) only what was learned is written: inertials, places of joints, "
-        "friction; every other byte stays as it is. Or write a recording as a data set of LeRobot."
+        "friction; every other byte stays as it is. With --servo a robot is written whose joints "
+        "follow position commands as its servos do. Or write a recording as a data set of LeRobot."
     )
     add = parser.add_argument
-    add("model", type=Path, metavar="MODEL|LOG", help="model file (.json), or a recording")
+    what = "model file (.json), with --servo any robot, or a recording"
+    add("model", type=Path, metavar="MODEL|LOG", help=what)
+    said = "servo.toml of gap: MuJoCo's position actuators, delay, friction, armature, ground"
+    add("--servo", type=Path, metavar="FILE", help=said)
     add("--lerobot", type=Path, metavar="FOLDER", help="of LOG: a data set, version 3, to write")
     add("--urdf", type=Path, metavar="FILE", help="to write")
     add("--mjcf", type=Path, metavar="FILE", help="to write")
@@ -122,10 +126,12 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 def _check_export(args: argparse.Namespace) -> None:
     if args.lerobot is not None:
-        if args.urdf or args.mjcf or args.onto or args.alone:
+        if args.urdf or args.mjcf or args.onto or args.alone or args.servo:
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
-    if args.model.suffix != ".json":
+    if args.servo is not None:
+        options.check_robot(str(args.model))
+    elif args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:
         if args.urdf is None and args.mjcf is None:
@@ -141,7 +147,7 @@ def _check_export(args: argparse.Namespace) -> None:
     for option, path, other in (("--urdf", args.urdf, ".xml"), ("--mjcf", args.mjcf, ".urdf")):
         if path is not None and path.suffix == other:
             raise UsageError(f"{option} {path}: have: --urdf FILE.urdf, --mjcf FILE.xml")
-    options.check_files(args.model, args.onto)
+    options.check_files(args.model if args.servo is None else None, args.servo, args.onto)
 
 
 def declare_report(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,14 @@ from adapter.errors import MeansError, UsageError
 from adapter.gap import servo_words
 from adapter.gap.result import GapResult, Shortfall
 from adapter.gap.servo import explain
+from adapter.gap.servo_arms import beside
 from adapter.gap.servo_model import read_servos
 from adapter.gap.words import as_json, console_summary
 from adapter.gap.workflow import GapSettings, find_gap, names_of
 from adapter.model.model_file import load_model
 from adapter.report.gap_page import render_gap_page
 from adapter.report.html import write_whole
+from adapter.report.servo_page import render_servo_page
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import (
     complain,
@@ -165,9 +167,10 @@ def _position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | No
     read = {path: read_position_log(path, args.topic) for path in dict.fromkeys(paths)}
     without = [path for path, log in read.items() if log is None]
     if len(without) == len(read):
-        if args.servo is not None:
+        if args.servo is not None or args.beside:
+            option = "--beside" if args.servo is None else "--servo"
             raise UsageError(
-                f"--servo: {without[0]} holds no position commands beside positions without "
+                f"{option}: {without[0]} holds no position commands beside positions without "
                 "efforts (/joint_commands and /joint_states)"
             )
         return None
@@ -203,8 +206,24 @@ def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list
         complain(refusal)
         return ExitCode.DONE if refusal.kind.is_an_answer else ExitCode.WRONG_USE
     gap.servos.save(target)
-    _write(args, folder, {**servo_words.as_json(gap), "servos_out": str(target)})
+    facts = {**servo_words.as_json(gap), "servos_out": str(target)}
+    own = "this arm" if args.out is None else folder.resolve().name
+    numbers = beside(facts, own, args.beside) if args.beside else []
+    facts["beside"] = [asdict(number) for number in numbers]
+    page = folder / "report.html"
+    page.unlink(missing_ok=True)  # of an earlier result
+    if not args.no_report:
+        facts["report"] = str(
+            write_whole(page, render_servo_page(gap, str(args.model), target, numbers))
+        )
+    _write(args, folder, facts)
     for line in servo_words.lines(gap):
         output.print(Text.from_markup(line), soft_wrap=True)
+    for line in (text for number in numbers for text in number.sentences()):
+        show(f"differs: {line}")
+    if numbers and not any(number.odd for number in numbers):
+        show(f"{len(numbers)} numbers beside other arms: none differs beyond both doubts")
     say(f"servos {target}")
+    if not args.no_report:
+        show(f"report {page}")
     return 0

@@ -22,6 +22,7 @@ GAP_WORDS = {
     "--inertia-prior": "standard deviation of the model's inertial numbers, of their size "
     "(default 0.05, centres to 0.1 m times that; of a position-controlled arm 0.02)",
     "--hold-out": "score on these, fit all others (default: blocks of time are held out in turn)",
+    "--beside": "results of other position-controlled arms of this kind: whose servos differ",
     "--rounds": "rounds of the search, in each of which something may be named (default 24)",
     "--simulator": "of the forward simulation (default pybullet where it is installed, extra "
     "[sim]; mujoco is the extra [mujoco])",
@@ -46,6 +47,7 @@ def declare_gap(parser: argparse.ArgumentParser) -> None:
     options.add_told(parser)
     add("--inertia-prior", type=float, metavar="SHARE")
     add("--hold-out", nargs="+", action="extend", default=[], type=Path, metavar="LOG")
+    add("--beside", nargs="+", action="extend", default=[], type=Path, metavar="RESULTS")
     add("--validate-from", type=float, metavar="S", help="fit before this second, score after it")
     add("--rounds", type=int, metavar="N")
     add_effects(parser)

@@ -25,6 +25,7 @@ from adapter.realtime.run_messages import TF_FIXED, TF_MOVING, RunMessages, Show
 from adapter.realtime.showing import DisplayJob, View
 from adapter.signals.records import StateLayout, stamp_of
 from drivers.files.estimates import EstimateNames
+from drivers.files.mcap.writer import ESTIMATES
 from drivers.files.messages import Message, encode
 from drivers.files.ros_types import FLOAT64_MULTI_ARRAY, LAMBDA_FIELDS, LOAD, THETA_FIELDS
 from drivers.registry import split_address
@@ -89,22 +90,14 @@ class Publisher:
         stamp_ns, q = stamp_of(newest), newest[self._layout.q].copy()
         found = self._messages.first(stamp_ns) if self._first else []
         self._first = False
-        if view.snapshot is not None and view.snapshot.version:
-            told = self._messages.estimate(view.snapshot)
-            found += told
-            if told:
-                for name, rows, columns, table in (
-                    ("/lambda", self._names.joints, LAMBDA_FIELDS, view.snapshot.lam),
-                    ("/theta", self._names.bodies, THETA_FIELDS, view.snapshot.theta),
-                ):
-                    fields = table_fields((",".join(rows), ",".join(columns)), table)
-                    found.append(Message(name, FLOAT64_MULTI_ARRAY, stamp_ns, fields))
-        found += self._messages.frames(stamp_ns, q)
-        if view.push is not None:
-            found += self._messages.push(view.push, q)
-        found += self._messages.news(stamp_ns, view.news)
-        if view.timing is not None:
-            found += self._messages.timing(stamp_ns, view.timing)
+        found += self._messages.seen(view, stamp_ns, q)
+        if view.snapshot is not None and any(x.topic == ESTIMATES for x in found):
+            for name, rows, columns, table in (
+                ("/lambda", self._names.joints, LAMBDA_FIELDS, view.snapshot.lam),
+                ("/theta", self._names.bodies, THETA_FIELDS, view.snapshot.theta),
+            ):
+                fields = table_fields((",".join(rows), ",".join(columns)), table)
+                found.append(Message(name, FLOAT64_MULTI_ARRAY, stamp_ns, fields))
         for message in found:
             self._send(message)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +15,11 @@ from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
-from adapter.effects.robots import RobotText, robot_mjcf, robot_urdf
+from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
+from adapter.gap.servo_files import servo_mjcf, servo_urdf
+from adapter.gap.servo_model import read_servos
 from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
@@ -183,15 +186,21 @@ def run_export(args: argparse.Namespace) -> int:
         write_json(args.json, {"lerobot": str(args.lerobot)})
         show(str(args.lerobot))
         return 0
-    model = check_effects(load_model(args.model), args.model)
+    writers: list[Callable[..., RobotText]] = [robot_urdf, robot_mjcf]
+    if args.servo is None:
+        model = check_effects(load_model(args.model), args.model)
+    else:
+        model = read_robot(str(args.model))
+        servos = read_servos(args.servo, model.tree.joint_names)
+        writers = [partial(write, servos=servos) for write in (servo_urdf, servo_mjcf)]
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):
         facts[key] = list(model.provenance.get(key, ()))
-    for kind, path, text_of in (("urdf", args.urdf, robot_urdf), ("mjcf", args.mjcf, robot_mjcf)):
+    for kind, path, text_of in zip(("urdf", "mjcf"), (args.urdf, args.mjcf), writers, strict=True):
         if path is None:
             continue
         fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")
-        written = text_of(model, args.onto if fits else None, args.alone)
+        written = text_of(model, onto=args.onto if fits else None, alone=args.alone)
         write_robot(path, written)
         facts[kind] = str(path)
         facts["onto"] = facts.get("onto") or written.onto

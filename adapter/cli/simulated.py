@@ -7,9 +7,9 @@ import dataclasses
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.settings import BusSettings
 from drivers.interface import Driver
-from drivers.pybullet_arm import PyBulletArm
 from sim.damiao.host import InProcess
 from sim.options import DEFAULT_SCENARIO, options_of
+from sim.plant import SimulatedArm
 from sim.scenarios import Scenario, build
 
 
@@ -30,7 +30,7 @@ class Simulation:
     def driver(self, rest: str) -> Driver:
         """The driver, with its plant; behind frames on a virtual bus where the address says so."""
         if not self.address.startswith("can:"):
-            return PyBulletArm(self.scenario.plant())
+            return SimulatedArm(self.scenario.plant())
         names = self.scenario.truth.joint_names
         channel = BusSettings.of(self.address, names).channel
         return InProcess(

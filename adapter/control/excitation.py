@@ -159,17 +159,19 @@ def plan_lines(
         )
     for j, name in enumerate(joint_names):
         low, high = limits.lower[j], limits.upper[j]
+        unit = "m" if limits.is_sliding(j) else "rad"
         room = "its limits are not documented"
         if np.isfinite(low) and np.isfinite(high):
             margin = min(lower[j] - low, high - upper[j])
-            room = f"limits {low:+.3f} .. {high:+.3f}, margin {margin:.3f} rad"
+            room = f"limits {low:+.3f} .. {high:+.3f}, margin {margin:.3f} {unit}"
         fast = f"up to {speed[j]:.3f}"
         if settings.slow_s:
             fast = f"at first {settings.slow_share * speed[j]:.3f}, then {speed[j]:.3f}"
+        turns = f"{math.degrees(lower[j]):+.1f} .. {math.degrees(upper[j]):+.1f} deg; "
         lines.append(
-            f"{name:{width}}  {lower[j]:+.3f} .. {upper[j]:+.3f} rad "
-            f"({math.degrees(lower[j]):+.1f} .. {math.degrees(upper[j]):+.1f} deg; "
-            f"{room}), {fast} rad/s ({speed[j] / fastest[j]:.0%} of {fastest[j]:.4g})"
+            f"{name:{width}}  {lower[j]:+.3f} .. {upper[j]:+.3f} {unit} "
+            f"({'' if unit == 'm' else turns}{room}), {fast} {unit}/s "
+            f"({speed[j] / fastest[j]:.0%} of {fastest[j]:.4g})"
         )
     lines.append(
         f"At most {np.max(acceleration / limits.acceleration):.0%} of the documented acceleration "

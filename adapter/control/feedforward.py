@@ -98,7 +98,7 @@ class ModelFeedforward(Feedforward):
             raise SettingsError("feed-forward needs a fixed base; this model's base floats")
         n = tree.n
         self.gravity = np.asarray(gravity, dtype=np.float64)
-        self._parent, self._base = tree.parent, base_at_rest(gravity)
+        self._tree, self._base = tree, base_at_rest(gravity)
         self._effects = effects_by_name(effect_names)
         self._units = [_shares_of_effect(effect) for effect in self._effects]
         self._known, self._shares = _split(known, n)
@@ -129,7 +129,7 @@ class ModelFeedforward(Feedforward):
         `shapes` (e, n) of effects that have several, as `Theta.shapes`.
         """
         self._asked = (None, None, None)
-        self.frames = frames_of(self._parent, lam)
+        self.frames = frames_of(self._tree, lam)
         self.theta = np.array(theta, dtype=np.float64).reshape(-1, 10)
         if shapes is None:
             shapes = np.full(np.shape(effect_values), np.nan)

@@ -107,7 +107,7 @@ class ArmInCell:
         self.model, self.cell = model, cell
         self.meanwhile: Callable[[], None] = lambda: None
         self.bodies = bodies_of(model, cell.hand)
-        self._frames = frames_of(model.tree.parent, model.lam)
+        self._frames = frames_of(model.tree, model.lam)
         n = model.tree.n
         self._R, self._o = np.zeros((n, 3, 3)), np.zeros((n, 3))
         self._shapes = [self._shape(body) for body in self.bodies]

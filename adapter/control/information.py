@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from adapter.effects.base import LearnedEffect
+from adapter.effects.base import LearnedEffect, of_sliding
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import effects_by_name
 from adapter.model.inertia import PARAMETERS, UNITS
@@ -97,7 +97,7 @@ class Information:
         extra = self._columns if self._effects else None
         self.basis = base_parameters(model.tree, model.lam, gravity, extra=extra).basis
         self._inertial = base_parameters(model.tree, model.lam, gravity).basis
-        own = [np.full(n, effect.learned_std) for effect in self._effects]
+        own = [x.learned_std * x.drums(model.tree.slides) for x in self._effects]
         self.size = np.concatenate([np.tile(BODY_SIZE, n), *own])
         scaled = self.basis / (BELIEF * self.size[:, None])
         self.prior: Array = scaled.T @ scaled
@@ -182,5 +182,5 @@ class Information:
             units += UNITS
         for effect in self._effects:
             names += [f"{joint} {effect.key}" for joint in tree.joint_names]
-            units += [effect.unit] * tree.n
+            units += [of_sliding(effect.unit) if slides else effect.unit for slides in tree.slides]
         return tuple(names), tuple(units)

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapter.effects.by_joint import DRUM_M
 from adapter.errors import SettingsError
 from adapter.model.robots import RobotFacts, facts_of
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
 from drivers.interface import Driver
 
-# Of an arm whose documentation is silent; modest: rad/s, rad/s², rad/s³, N m/s.
+# Of an arm whose documentation is silent; modest: rad/s, rad/s², rad/s³, N m/s. Of what slides the
+# same on a drum of 0.1 m: m/s, m/s², m/s³.
 UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK = 1.0, 5.0, 1000.0
 UNKNOWN_TORQUE_RATE = 1000.0
 
@@ -24,6 +26,7 @@ class MotionLimits:
     Attributes:
         known: the arm, where it is known by name.
         joint_names: () where nobody has named them.
+        slides: (n,) which joints do, whose limits are in m and N; () where none does.
     """
 
     lower: Array
@@ -35,6 +38,7 @@ class MotionLimits:
     torque_rate: Array
     known: RobotFacts | None = None
     joint_names: tuple[str, ...] = ()
+    slides: tuple[bool, ...] = ()
 
     @classmethod
     def of(cls, model: SelfModel) -> MotionLimits:
@@ -43,6 +47,7 @@ class MotionLimits:
         Of an arm that is known by name the vendor's limits hold, too.
         """
         n, known, limits = model.tree.n, facts_of(model), model.limits
+        modest = np.where(model.tree.slides, DRUM_M, 1.0)
         if known is not None:
             vendor = known.model.limits  # fmax and fmin: one's number where the other has none
             limits = Limits(
@@ -54,14 +59,19 @@ class MotionLimits:
         return cls(
             limits.lower,
             limits.upper,
-            np.where(np.isfinite(limits.velocity), limits.velocity, UNKNOWN_VELOCITY),
-            np.full(n, UNKNOWN_ACCELERATION) if known is None else known.acceleration,
-            np.full(n, UNKNOWN_JERK) if known is None else known.jerk,
+            np.where(np.isfinite(limits.velocity), limits.velocity, UNKNOWN_VELOCITY * modest),
+            UNKNOWN_ACCELERATION * modest if known is None else known.acceleration,
+            UNKNOWN_JERK * modest if known is None else known.jerk,
             np.where(np.isfinite(limits.effort), limits.effort, np.inf),
             np.full(n, UNKNOWN_TORQUE_RATE) if known is None else known.torque_rate,
             known,
             model.tree.joint_names,
+            model.tree.slides,
         )
+
+    def is_sliding(self, joint: int) -> bool:
+        """Whether a joint (from 0) slides."""
+        return bool(self.slides) and self.slides[joint]
 
     @property
     def robot(self) -> str:
@@ -95,8 +105,9 @@ def need_complete(model: SelfModel) -> None:
         raise SettingsError(
             f"{model.name}: an arm that may be real moves only within documented limits, and "
             f"these joints lack some: {'; '.join(lacks)}. Write them into the robot's file: "
-            '<limit lower="" upper="" velocity="" effort=""/> in rad, rad/s, N m, above zero; a '
-            "joint that turns without end needs a range for this, too (type revolute)"
+            '<limit lower="" upper="" velocity="" effort=""/> in rad, rad/s, N m (where it slides '
+            "m, m/s, N), above zero; a joint that turns without end needs a range for this, too "
+            "(type revolute)"
         )
 
 

@@ -250,7 +250,7 @@ def hand_wrench(frames, q, r, std, out):
     row = np.empty(6)
     j = n - 1
     while j >= 0:
-        line = axis_line(R[j], o[j])
+        line = axis_line(R[j], o[j], frames.slides[j])
         # moment about the axis of [f; m + o_n x f]
         row[0] = line[0] + line[4] * o[n - 1, 2] - line[5] * o[n - 1, 1]
         row[1] = line[1] + line[5] * o[n - 1, 0] - line[3] * o[n - 1, 2]

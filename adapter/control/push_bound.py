@@ -62,7 +62,7 @@ def push_bound(
 ) -> PushBound:
     """The bound of a motion that was drawn."""
     joints = safety.external_share * limits.effort
-    frames, n = frames_of(model.tree.parent, model.lam), model.tree.n
+    frames, n = frames_of(model.tree, model.lam), model.tree.n
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
     z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
     angle, radius, forces = GOLDEN_ANGLE * np.arange(DIRECTIONS), np.sqrt(1.0 - z**2), []

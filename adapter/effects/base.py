@@ -12,8 +12,9 @@ predicts is computed in four stages, and every effect belongs to one of them:
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, wraps
 from typing import Any, ClassVar, Protocol, TypeVar, cast
@@ -21,7 +22,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
+from adapter.effects.by_joint import DRUM_M, ByJoint, JointSignals, smooth_sign
 from adapter.effects.phrases import DecidingExperiment, Phrase
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
@@ -50,6 +51,22 @@ JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 def with_squares(unit: str) -> str:
     """A unit of a file as people write it: kg m² for kg m2."""
     return unit.translate(str.maketrans("234", "²³⁴"))
+
+
+def of_sliding(unit: str) -> str:
+    """The unit of a joint's number where the joint slides: N s/m for N m s/rad, kg for kg m2."""
+    return unit.replace("kg m2", "kg").replace("N m", "N").replace("rad", "m")
+
+
+def on_drum(unit: str) -> float:
+    """By which the usual size of a joint's number, of that unit, is multiplied where it slides."""
+
+    def power(part: str) -> int:
+        turns = sum(int(x or 1) for x in re.findall(r"rad(\d?)", part))
+        return turns - part.count("N m") - 2 * part.count("kg m2")
+
+    above, _, below = unit.partition("/")
+    return float(DRUM_M ** (power(above) - power(below)))
 
 
 @dataclass(frozen=True)
@@ -88,6 +105,9 @@ class ArmDynamics(Protocol):
 
     @property
     def gravity(self) -> Array: ...
+
+    @property
+    def slides(self) -> tuple[bool, ...]: ...
 
     def changed(self, theta: Array | None = None, gravity: Array | None = None) -> ArmDynamics: ...
 
@@ -131,7 +151,12 @@ class Motion:
     @property
     def direction(self) -> Array:
         """sign(dq) (m, n), smoothed around rest."""
-        return smooth_sign(self.dq)
+        return smooth_sign(self.dq, drum=self.drums)
+
+    @property
+    def drums(self) -> Array:
+        """(n,) DRUM_M of joints that slide, one of others."""
+        return np.where(self.arm.slides, DRUM_M, 1.0)
 
     def moved(self, joint: int, q: Array, dq: Array, ddq: Array) -> Motion:
         """The same with the joint (from 0) displaced by q, dq, ddq (m,)."""
@@ -276,6 +301,8 @@ class Effect(ABC):
         parameters: in the order of the catalogue.
         prior_std: how large its coefficient may well be, or each of several; the prior's mean is
             zero. One prior for the search, the learner and the monitor.
+        coefficients: their units, where these are not those of the first parameters.
+        turns: whether it repeats with turns, and no joint that slides has it.
         phrase: how to say that it is there.
         place: what a joint of a robot's file calls it (`urdf_text`), if it has a name for it.
         shows: what it shows in the experiments of `phrases` that touch it.
@@ -304,6 +331,8 @@ class Effect(ABC):
     scope: ClassVar[str] = JOINT
     parameters: ClassVar[tuple[Parameter, ...]]
     prior_std: ClassVar[float | tuple[float, ...]]
+    coefficients: ClassVar[tuple[str, ...]] = ()
+    turns: ClassVar[bool] = False
     phrase: ClassVar[Phrase] = Phrase()
     place: ClassVar[str] = NO_PLACE
     shows: ClassVar[tuple[tuple[DecidingExperiment, str], ...]] = ()
@@ -404,9 +433,18 @@ class Effect(ABC):
             if np.any(value < p.lower) or np.any(value > p.upper):
                 raise ModelError(f"{where} is {given}, outside {p.lower:g} to {p.upper:g}")
 
-    def units(self) -> dict[str, str]:
-        """Unit of each parameter."""
-        return {p.key: p.unit for p in self.parameters}
+    def units(self, slides: bool = False) -> dict[str, str]:
+        """Unit of each parameter; of a joint that slides."""
+        own = slides and self.scope in (JOINT, ALL)
+        return {p.key: of_sliding(p.unit) if own else p.unit for p in self.parameters}
+
+    def on_sliding(self, template: Template) -> Template:
+        """A template as it is looked for on a joint that slides."""
+        if self.scope != JOINT:
+            return template
+        units = self.coefficients or [p.unit for p in self.parameters]
+        sizes = zip(template.prior_std, units, strict=False)
+        return replace(template, prior_std=tuple(std * on_drum(unit) for std, unit in sizes))
 
 
 class MotionEffect(Effect):
@@ -474,7 +512,8 @@ class JointTorque(TorqueEffect):
         """The law on one joint."""
         q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
         numbers = {key: x if np.ndim(x) else float(x) for key, x in values.items()}
-        return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), numbers))
+        at = JointSignals(q, dq, ddq, own, drum=float(motion.drums[joint]))
+        return on_joint(motion, joint, self.law(at, numbers))
 
     def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The law itself."""
@@ -526,6 +565,10 @@ class LearnedEffect(Effect):
     def learned_std(self) -> float:
         """How large the parameter may well be."""
         return float(np.atleast_1d(self.prior_std)[self.learned])
+
+    def drums(self, slides: Sequence[bool]) -> Array:
+        """(n,) by which its usual sizes are multiplied on joints of which some slide."""
+        return np.where(slides, on_drum(self.unit), 1.0)
 
     @abstractmethod
     def basis(self, at: JointSignals) -> tuple[Array, ...]:

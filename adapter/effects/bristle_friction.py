@@ -22,7 +22,7 @@ from adapter.effects.base import (
     late_jit,
     on_joint,
 )
-from adapter.effects.by_joint import WAYS_RAD, shares_of_ways, smooth_sign
+from adapter.effects.by_joint import WAYS_RAD, shares_of_ways
 from adapter.effects.phrases import SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import FRICTION, Additions
 
@@ -73,7 +73,7 @@ class Rubs(JointTorque):
         """The level times z, which is zero before the motion; of rows apart as if each slid."""
         dq, s0 = motion.dq[:, joint], self.bristles(values)
         at_once = motion.apart or s0 is None
-        z = smooth_sign(dq) if at_once else bending(motion.q[:, joint], cast(float, s0))
+        z = motion.direction[:, joint] if at_once else bending(motion.q[:, joint], cast(float, s0))
         return on_joint(motion, joint, self.level(dq, values) * z)
 
 

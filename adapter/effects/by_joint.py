@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from adapter.model.spatial import Array
 
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
+# m: a joint that slides is taken to have what one that turns a drum of this radius has
+DRUM_M = 0.1
 STRIBECK_SPEED = 0.05  # rad/s, published ones are 0.02 to 0.1; static friction acts below it
 AT_REST = 3.0  # times what static friction is above Coulomb's: a rest holds up to all of it
 # Over which bristles wind up that somebody remembers; those of the first one slide at once.
@@ -34,16 +36,18 @@ def shares_of_ways(way: Array | float) -> Array:
     return np.maximum(0.0, 1.0 - np.abs(at - steps))
 
 
-def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -> Array:
-    """sign(dq), smoothed around rest as tanh(dq / w): w = 0.01 rad/s.
+def smooth_sign(
+    dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0, drum: Array | float = 1.0
+) -> Array:
+    """sign(dq), smoothed around rest as tanh(dq / w): w = 0.01 rad/s, times `drum` (1 or DRUM_M).
 
     Where the signals have gone through a low-pass, `smoothing_s` says how long it takes a step;
     what jumps in an effect must be as smooth as what jumps in the torque, so w is at least as
     far as dq goes within that time.
     """
     if not smoothing_s or ddq is None:
-        return np.tanh(dq / SMOOTHING_DQ)
-    return np.tanh(dq / np.hypot(SMOOTHING_DQ, smoothing_s * ddq))
+        return np.tanh(dq / (SMOOTHING_DQ * drum))
+    return np.tanh(dq / np.hypot(SMOOTHING_DQ * drum, smoothing_s * ddq))
 
 
 def slowness(dq: Array) -> Array:
@@ -63,6 +67,7 @@ class JointSignals(NamedTuple):
             nobody remembers the way.
         rates: (2, ...) rates of the joint's torque by the model, N m/s and N m/s²; zeros where
             nobody knows what came before.
+        drum: of `smooth_sign`.
     """
 
     q: Array
@@ -72,11 +77,12 @@ class JointSignals(NamedTuple):
     smoothing_s: float = 0.0
     bent: Array = np.zeros(len(WAYS_RAD))
     rates: Array = np.zeros(2)
+    drum: float = 1.0
 
     @property
     def direction(self) -> Array:
         """sign(dq), as smooth as the signals are."""
-        return smooth_sign(self.dq, self.ddq, self.smoothing_s)
+        return smooth_sign(self.dq, self.ddq, self.smoothing_s, self.drum)
 
 
 class JointLaw(Protocol):

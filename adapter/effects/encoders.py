@@ -57,7 +57,7 @@ class EncoderRipple(MotionEffect):
     name = "encoder_ripple"
     title = "encoder ripple"
     parameters = (Parameter("a", "rad"), Parameter("phase", "rad"))
-    prior_std = (5e-3, 5e-3)
+    prior_std, turns = (5e-3, 5e-3), True
     log_odds = -2.0
     inexact = 0.02
     phrase = Phrase("the encoder of {who} errs by {a} once per turn")
@@ -90,6 +90,7 @@ class JointElasticity(MotionEffect):
     title = "joint elasticity"
     parameters = (Parameter("k", "N m/rad"),)
     prior_std = 2e-4  # rad/(N m), of 1/k: a typical harmonic drive has 5000 N m/rad
+    coefficients = ("rad/(N m)",)
     positive = ("k",)
     inexact = 0.05
     phrase = Phrase("{who} {is} elastic, with a stiffness of {k}")

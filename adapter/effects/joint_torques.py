@@ -57,6 +57,7 @@ class TorqueRipple(JointTorque):
         Parameter("phase", "rad"),
     )
     inexact = 0.01
+    turns = True
     phrase = Phrase("{who} {has} a torque ripple of {a}, {n}")
     shows = ((TURN, "repeats along the turn"),)
     over_angle = True
@@ -92,7 +93,7 @@ class JointSpring(LearnedEffect, JointTorque):
     name = "joint_spring"
     title = "joint spring"
     parameters = (Parameter("k", "N m/rad"), Parameter("q0", "rad"))
-    prior_std = (1.0, 1.0)
+    prior_std, coefficients = (1.0, 1.0), ("N m/rad", "N m/rad")
     place = STIFFNESS
     phrase = Phrase(
         "a spring of {x} pulls {who} towards {q0}", "k", "{who} {is} pushed away from {q0} by {x}"

@@ -219,6 +219,7 @@ class Law(OverSignals):
         self.variables = frozenset(re.findall(r"ddq|dq|tau|q", expression.text))
         self.by_load = "tau" in self.variables  # type: ignore[misc]
         self.positive = ("c",) if expression.drags else ()  # type: ignore[misc]
+        self.turns = bool(setting and setting.wave)  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
         own = [Parameter("c", expression.unit)]
         own += [Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []

@@ -164,10 +164,11 @@ def _additions(model: SelfModel, places: Sequence[str], acting: Sequence[Active]
         note = "it ended"
         if active.lasting:
             part = active.effect.export(more, active.joint, active.values)
-            if part is None:
+            if part is None or not any(map(np.any, active.values.values())):
                 continue
             note = part
-        name, units = active.effect.name, active.effect.units()
+        slides = active.joint >= 0 and model.tree.slides[active.joint]
+        name, units = active.effect.name, active.effect.units(slides)
         where = "" if active.joint < 0 else f" of {model.tree.joint_names[active.joint]}"
         numbers = [f"{key} = {_number(x)} {units[key]}" for key, x in active.values.items()]
         said = f"{name}{where}, {', '.join(numbers)}"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from adapter.experiments.baselines.compare import Errors, arm_tables, compare, contenders
-from adapter.experiments.baselines.features import Columns, sub_chain, sub_parents
+from adapter.experiments.baselines.learner import Columns, sub_chain, sub_parents
 from adapter.experiments.falls import Falls, Split, gathered, sets_of, split
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
 from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
@@ -210,7 +210,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         learners += _baselines(args, source, parts, say)
     say("learning online, sample by sample")
     used = [k for k in range(count) if k not in parts.control][:3]  # 30 s in all
-    motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
+    motions = [noisy(source.exact(k), k) for k in used]
     online, _ = online_trial(motions, source.exact(parts.control[0]), truth.lam)
     say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")
     found = topology_trials(fall_logs(source.noisy, args.seeds), tree, args.seed)
@@ -347,15 +347,9 @@ NOISE_TAU = 0.01
 SETTINGS = LearnerSettings(rebuild_rows=3, rebuild_stds=3.0, schema=SchemaSettings(judge_every=20))
 
 
-def without_velocity(data: TreeData) -> TreeData:
-    """The same samples without the links' linear velocity, which no sensor on a link shows."""
-    assert data.links is not None
-    base, links = (BodyMotion(x.w, x.a, x.dw) for x in (data.base, data.links))
-    return TreeData(data.tree, data.q, data.dq, data.ddq, data.tau, base, links)
-
-
 def noisy(data: TreeData, seed: int) -> TreeData:
-    """White noise on all that is measured; the wrench of a free fall stays zero."""
+    """White noise on all that is measured, no linear velocity, which no sensor on a link shows; the
+    wrench of a free fall stays zero."""
     rng = np.random.default_rng(seed)
 
     def with_noise(x: Array, std: float | Array) -> Array:

@@ -92,7 +92,7 @@ class Falls:
     def exact(self, k: int) -> TreeData:
         """Trajectory k without noise."""
         record = self._exact.exact(k)
-        links = record.links(self.truth)
+        v, w, a, dw = record.links(self.truth)
         free = np.zeros((len(record.q), 6))  # nothing pushes a falling base
         return TreeData(
             self.tree,
@@ -101,7 +101,7 @@ class Falls:
             record.ddq,
             np.hstack([free, record.tau]),
             BodyMotion(record.base_w, record.base_a, record.base_dw, record.base_v),
-            BodyMotion(links.w, links.a, links.dw, links.v),
+            BodyMotion(w, a, dw, v),
         )
 
     def measured(self, k: int) -> TreeData:

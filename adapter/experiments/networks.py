@@ -26,7 +26,7 @@ from adapter.errors import ModelError
 from adapter.learning.tree_data import TreeData, check_motion
 from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import BASE
-from adapter.physics.networks import turn_z
+from adapter.physics.networks import skew, turn_z
 
 # A cost below this share of the signal's is rounding: motion right to 1e-8 of its size.
 ROUNDING = 1e-16
@@ -165,17 +165,6 @@ def _lam(frames: StartFrames) -> Array:
 
 # --- the networks of all joints and starts as one batch of tensors ------------------------------
 
-# [x]× as a linear map of x: row a of the table (3, 9) is that of unit vector a.
-_CROSS = torch.zeros(3, 3, 3, dtype=torch.float64)
-for _a, _b, _c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _CROSS[_a, _c, _b], _CROSS[_a, _b, _c] = 1.0, -1.0
-_CROSS = _CROSS.reshape(3, 9)
-
-
-def cross_matrix(x: Tensor) -> Tensor:
-    """[x]× (..., 3, 3) of vectors (..., 3)."""
-    return (x @ _CROSS).unflatten(-1, (3, 3))
-
 
 @dataclass
 class NetworkSignals:
@@ -210,7 +199,7 @@ class StartFrames:
     def moved(self, step: Tensor) -> StartFrames:
         """The frames after (turn, shift) (n, starts, 6) in the parent's axes."""
         angle = step[..., :3].norm(dim=-1)[..., None, None]
-        k = cross_matrix(step[..., :3])
+        k = skew(step[..., :3])
         half = torch.sinc(angle / (2.0 * torch.pi))
         turn = torch.eye(3, dtype=k.dtype) + torch.sinc(angle / torch.pi) * k
         turn = turn + 0.5 * half**2 * (k @ k)
@@ -231,8 +220,8 @@ def network_signals(data: TreeData, channels: Sequence[str]) -> NetworkSignals:
         bodies = getattr(data.base, name)[:, None], getattr(data.links, name)
         every = np.concatenate(bodies, axis=1)[:, parents]
         up[name] = torch.from_numpy(np.ascontiguousarray(every))
-    spin = cross_matrix(up["w"])
-    carried = {"w": torch.zeros_like(spin), "v": spin, "a": cross_matrix(up["dw"]) + spin @ spin}
+    spin = skew(up["w"])
+    carried = {"w": torch.zeros_like(spin), "v": spin, "a": skew(up["dw"]) + spin @ spin}
     y = []
     for name in channels:
         own = torch.from_numpy(np.array(getattr(data.links, name)))
@@ -262,7 +251,7 @@ def slope_and_curvature(frames: StartFrames, s: NetworkSignals) -> tuple[Tensor,
     """`costs`, their gradient (n, starts, 6) and Gauss-Newton's curvature (n, starts, 6, 6)."""
     left, turned = residuals(frames, s)
     n, starts = frames.p.shape[:2]
-    by_turn = -cross_matrix(turned).flatten(2, 3)
+    by_turn = -skew(turned).flatten(2, 3)
     by_shift = -s.w.transpose(0, 1).reshape(n, 1, -1, 3).expand(n, starts, -1, 3)
     jacobian = torch.cat([by_turn, by_shift], dim=-1)
     across = jacobian.transpose(-1, -2) / len(s.y)

@@ -26,9 +26,9 @@ from adapter.runs.pipeline import make_front_end
 from adapter.signals.front_end import FrontEnd
 from drivers.files.mcap import Log
 from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
 from sim.falls.data_set import FallData
 from sim.falls.fall import RATE_HZ
+from sim.plant import SimulatedArm
 from sim.scenarios import Scenario, build
 
 MOTION_S = 10.0  # of each recording, from its start (the project's goal: at most that)
@@ -141,10 +141,10 @@ def panda_moves(
     duration_s: float,
     settings: PipelineSettings,
     learner: OnlineLearner | None = None,
-) -> tuple[PyBulletArm, list[JointSample], FrontEnd]:
+) -> tuple[SimulatedArm, list[JointSample], FrontEnd]:
     """A simulated arm moves by itself, drawn by its seed; what it said, and what heard it."""
     samples: list[JointSample] = []
-    arm, front_end = PyBulletArm(world.plant()), make_front_end(robot, settings)
+    arm, front_end = SimulatedArm(world.plant()), make_front_end(robot, settings)
     excitation = ExcitationSettings(seed=world.seed)
     controller = ExcitationController(MotionLimits.of(robot), excitation)
 

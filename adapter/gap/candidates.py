@@ -54,6 +54,7 @@ class Candidate:
         joint: from 0; -1 where the effect has none.
         columns: places of its signatures in the table of all signatures.
         log_odds: ln of what it is worth before the data where it acts all the time.
+        slides: whether its joint does.
     """
 
     effect: Effect
@@ -61,11 +62,17 @@ class Candidate:
     joint: int
     columns: tuple[int, ...]
     log_odds: float = 0.0
+    slides: bool = False
 
     @property
     def key(self) -> tuple[str, int]:
         """Effect and joint."""
         return self.effect.name, self.joint
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return self.effect.units(self.slides)
 
     @property
     def columns_are_theta(self) -> bool:
@@ -148,6 +155,11 @@ def stages_of(
     return Stages(signals, links, rigid, total, sensors(links, total, effects), has_bodies)
 
 
+def slides(arm: ArmDynamics, joint: int) -> bool:
+    """Whether a joint (from 0, or -1 for none) slides."""
+    return joint >= 0 and arm.slides[joint]
+
+
 def places(effect: Effect, n: int) -> tuple[int, ...]:
     """Joints (from 0) where an effect may be; -1 where it has none of its own."""
     if effect.scope in (FLANGE, BASE):
@@ -182,17 +194,21 @@ def signatures(
         (c, k, n) N m per unit of the coefficient; candidates. The first 10 n signatures are
         those of θ.
     """
-    n, seconds = at.links.arm.n, float(np.ptp(at.links.t))
+    arm, n, seconds = at.links.arm, at.links.arm.n, float(np.ptp(at.links.t))
     tables, candidates, size = [at.low_regressor()], [], 10 * n
     ways = [
         (effect.over(seconds), joint, template)
         for effect in CATALOGUE.values()
         for joint in places(effect, n)
         if joint < 0 or effect.scope == LINK or joint in joints
+        if not (effect.turns and slides(arm, joint))
         for template in templates(effect, hand, at.links.q[:, joint] if joint >= 0 else None)
     ]
     ways += extra
     for effect, joint, template in ways:
+        on_slide = slides(arm, joint)
+        if on_slide and not isinstance(effect, Pattern | Law):  # of these it is known by torque
+            template = effect.on_sliding(template)
         if effect.is_theta and template.theta is None:
             k = 10 * (joint if joint >= 0 else n - 1)
             columns = tuple(range(k, k + 10))
@@ -204,7 +220,7 @@ def signatures(
         if joint >= 0:
             values = template.decode(np.array(template.prior_std))
             odds += effect.log_odds_over(values, float(np.ptp(at.links.q[:, joint])))
-        candidates.append(Candidate(effect, template, joint, columns, odds))
+        candidates.append(Candidate(effect, template, joint, columns, odds, on_slide))
     return np.concatenate(tables), candidates
 
 
@@ -320,6 +336,8 @@ def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]
         if law.by > stages[0].links.arm.n or law.by == joint + 1 or law.name in kept:
             continue
         setting = law.expression.setting
+        if law.turns and slides(stages[0].links.arm, joint):
+            continue
         low, high = seen[setting.within if setting else ""]
         tried = [low + share * (high - low) for share in setting.tried] if setting else [1.0]
         for template in map(law.at, tried):

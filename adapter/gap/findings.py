@@ -65,7 +65,7 @@ def entries(
                     "joints": _joints(named),
                     "interval_s": None if begin is None and end is None else [begin, end],
                     "parameters": named.values,
-                    "units": named.candidate.effect.units(),
+                    "units": named.candidate.units,
                 }
             )
             if covariance is not None:
@@ -239,7 +239,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
                 lasting=not np.isfinite(end),
                 parameters=values,
                 std=spread,
-                units=effect.units(),
+                units=named.candidate.units,
                 evidence=evidence,
                 overlaps=overlaps,
                 split_by="; ".join(experiments(effect, [KNOWN[x] for x in overlaps])),

@@ -108,7 +108,9 @@ def falling(fit: Fit, joint: int) -> Fit:
             continue
         template = STRIBECK.reshaped({"vs": STRIBECK_SPEED, "s0": e.values["s0"]}, 1.0)[0]
         odds = prior_log_odds(STRIBECK, joint, fit.n, len(STRIBECK.templates()))
-        falling = Named(Candidate(STRIBECK, template, joint, (), odds), np.repeat(e.x, 2))
+        falling = Named(
+            Candidate(STRIBECK, template, joint, (), odds, e.candidate.slides), np.repeat(e.x, 2)
+        )
         other, _ = under_own_noise(shaped(refitted(bare.instead(k, falling))[0], k))
         asked, found = (
             replace(x, noise=_least(fit, other, joint), doubts=other.doubts) for x in (bare, other)

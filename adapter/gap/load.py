@@ -113,7 +113,11 @@ def find_load(
     share = inertia_prior or (DOCUMENTED_SHARE if empty is None else 0.2)  # of the inertias
     taken = [_taken(one, model) for one in logs]
     notes += [note for x in taken for note in x.notes]
-    std, n, whole = prior_std(model.theta, share), model.tree.n, taken[0].moments.together()
+    std, n, whole = (
+        prior_std(model.theta, model.tree.slides, share),
+        model.tree.n,
+        taken[0].moments.together(),
+    )
     parts = [Part(whole, np.arange(len(std)), taken[0].alive)]
     if empty is not None:  # the same arm: its load is nothing, its static friction another
         at = np.arange(len(std))
@@ -135,7 +139,7 @@ def plain_load(log: Log, model: SelfModel, share: float) -> HandLoad:
     Args:
         share: by which the model's inertias may be off, one standard deviation.
     """
-    std = prior_std(model.theta, share)
+    std = prior_std(model.theta, model.tree.slides, share)
     whole, held = _of_all(log, model).together(), positive(std, model.tree.n)
     found = judge([Part(whole, np.arange(len(std)), np.ptp(log.tau, axis=0) > 0.0)], std, held)
     return load_of(found.x[:10], found.covariance[:10, :10], hand_frame(model))

@@ -175,7 +175,7 @@ class Monitor:
         more = np.sqrt(theta.banded(squares) + LEAST_NM**2)  # static friction above Coulomb's
         self._belief.extend(np.tile(more, len(STRIBECK_SPEEDS)))
         R0, p = learner.frames
-        self._frames = LearnedFrames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
+        self._frames = LearnedFrames(learner.tree, R0, p, learner.base, theta.smoothing_s)
         self._level = Level(theta.variance(theta.least_squares()), 2.0)  # a first guess
         self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []

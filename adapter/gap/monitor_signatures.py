@@ -17,6 +17,7 @@ from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.evidence import score, scores
 from adapter.model.spatial import Array
+from adapter.model.tree import Tree
 from adapter.physics import kernels
 from adapter.screening.likelihood import LOAD_STD
 
@@ -127,17 +128,15 @@ class LearnedFrames:
     """The learned frames, and all columns of torque on them.
 
     Args:
-        parent: (n,) indices of the parents; R0, p: placements, copied.
+        tree: N and A; R0, p: placements, copied.
         base: (12,) motion of the base.
         smoothing_s: how long the filter takes a step of torque.
     """
 
-    def __init__(
-        self, parent: Sequence[int], R0: Array, p: Array, base: Array, smoothing_s: float
-    ) -> None:
-        self.n = len(parent)
+    def __init__(self, tree: Tree, R0: Array, p: Array, base: Array, smoothing_s: float) -> None:
+        self.n = tree.n
         self.R0, self.p, self._base = R0.copy(), p.copy(), base
-        self._frames = kernels.Frames(np.array(parent, dtype=np.int64), self.R0, self.p)
+        self._frames = kernels.placed(tree, self.R0, self.p)
         self._smoothing_s = smoothing_s
 
     def regressor(self, q: Array, dq: Array, ddq: Array) -> Array:

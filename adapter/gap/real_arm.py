@@ -16,7 +16,7 @@ import numpy as np
 from adapter.effects.active import active_effects
 from adapter.effects.base import Effect, Template
 from adapter.effects.catalogue import CATALOGUE, HELD
-from adapter.gap.candidates import Candidate, is_finer
+from adapter.gap.candidates import Candidate, is_finer, slides
 from adapter.gap.evidence import Carried, Moments
 from adapter.gap.fit import (
     TIMING_STD_S,
@@ -140,7 +140,7 @@ def as_driven(fit: Fit, joints: Sequence[int], first: Sequence[Named]) -> Fit:
         joints: (from 0) that move.
     """
     fit = _beside(fit.with_named(first), joints, DRIVEN)
-    at_once = [_assumed(COULOMB, j) for j in joints]
+    at_once = [_assumed(fit, COULOMB, j) for j in joints]
     return fit.with_named([*fit.named, *at_once])
 
 
@@ -211,19 +211,23 @@ def _named(effect: Effect, template: Template, joint: int) -> Named:
     return Named(Candidate(effect, template, joint, ()), np.zeros(len(template.prior_std)))
 
 
-def _assumed(effect: Effect, joint: int) -> Named:
+def _assumed(fit: Fit, effect: Effect, joint: int) -> Named:
     """An effect that any arm has, of its usual size (`priors`, or as its template says)."""
     template = effect.templates()[1 if effect is BRISTLES else 0]  # bristles of a Panda
     if effect.name in EFFECT_STD:
         std = EFFECT_STD[effect.name], *[1e-3] * (len(template.prior_std) - 1)  # N m/rad
         template = replace(template, prior_std=std)
-    return replace(_named(effect, template, joint), assumed=True)
+    named, on_slide = _named(effect, template, joint), slides(fit.model.arm, joint)
+    if on_slide:
+        own = replace(named.candidate, template=effect.on_sliding(template), slides=True)
+        named = replace(named, candidate=own)
+    return replace(named, assumed=True)
 
 
 def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = (*DRIVEN, SPRING)) -> Fit:
     """With dry friction and offsets of all torques and what joints (from 0) that move have."""
     own = [
-        _assumed(effect, j)
+        _assumed(fit, effect, j)
         for effects, where in ((EVERYWHERE, sorted(fit.heard)), (moving, joints))
         for effect in effects
         for j in where
@@ -234,5 +238,5 @@ def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = (*DRIVEN
 def _as_any_arm(fit: Fit, joints: Sequence[int]) -> Fit:
     """The same, with what the whole arm has: a filter of its torques, a table that is not level."""
     fit = _beside(fit, joints)
-    whole = [_assumed(CATALOGUE[name], -1) for name in ("torque_filter", "base_tilt")]
+    whole = [_assumed(fit, CATALOGUE[name], -1) for name in ("torque_filter", "base_tilt")]
     return fit.with_named([*fit.named, *whole])

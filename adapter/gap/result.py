@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from adapter.effects.base import of_sliding
 from adapter.model.numbers import plus_minus
 from adapter.model.spatial import Array
 from drivers.files.html_table import html_table
@@ -229,6 +230,7 @@ class GapResult:
         wall_s: how long all that took.
         sampled: of recordings that are too long to be searched whole, the stretches that were.
         torque_gains: of the drives, where they were learned (`torque_gains.TorqueGains`).
+        slides: (n,) whether each joint does: its figures are then in N and m, whatever their names.
     """
 
     joint_names: tuple[str, ...]
@@ -258,13 +260,23 @@ class GapResult:
     in_sample: bool = False
     torque_gains: dict[str, Any] | None = None
     sampled: tuple[dict[str, Any], ...] = ()
+    slides: tuple[bool, ...] = ()
+
+    def unit(self, unit: str, joint: int | None = None) -> str:
+        """A unit of turning joints as it is of a joint (from 0), or of all: N m (N of joint 1)."""
+        own = [j for j, slides in enumerate(self.slides) if slides]
+        if joint is not None:
+            return of_sliding(unit) if joint in own else unit
+        sliding = f" ({of_sliding(unit)} of joint {', '.join(str(j + 1) for j in own)})"
+        return unit + sliding * bool(own)
 
     def __repr__(self) -> str:
         if self.problem is not None:
             return f"GapResult({self.problem})"
         before, after = (np.max(part.torque_rmse_nm) for part in (self.before, self.after))
         names = ", ".join(dict.fromkeys(finding.effect for finding in self.findings)) or "nothing"
-        return f"GapResult({names} found, torque error at most {before:.2g} -> {after:.2g} N m)"
+        fell = f"{before:.2g} -> {after:.2g} {self.unit('N m')}"
+        return f"GapResult({names} found, torque error at most {fell})"
 
     def _repr_html_(self) -> str:
         """Findings, and the torque error of each joint before and after, for notebooks."""
@@ -276,7 +288,8 @@ class GapResult:
             map(plus_minus, self.after.torque_rmse_nm),
             strict=True,
         )
-        heads = ("joint", "torque error before, N m", "after, N m")
+        unit = self.unit("N m")
+        heads = ("joint", f"torque error before, {unit}", f"after, {unit}")
         return _findings_html(repr(self), self.findings) + html_table("", heads, list(errors))
 
     @classmethod

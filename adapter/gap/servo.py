@@ -8,27 +8,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from adapter.gap.hand import hand_frame
+from adapter.gap.result import RolloutCurves
 from adapter.gap.servo_fit import (
     ALL_FREE,
-    DELAY,
     PARAMETERS,
     Freedom,
     JointFit,
     JointTask,
     blocks,
+    equations,
     first_guess,
     fit_joint,
+    guesses,
+    misfit,
 )
 from adapter.gap.servo_ground import LEAST_JOINTS, find_ground
 from adapter.gap.servo_kernels import (
     DAMPING,
+    DEAD,
+    DELAY,
     INERTIA,
     LEAD,
     NO_GROUND,
+    PLAY,
     RUBS,
+    TIGHT,
+    WITHIN,
     A,
     Ground,
     Load,
@@ -38,8 +48,10 @@ from adapter.gap.servo_signals import Track, loads, over_ground
 from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.physics.kernels import place_frames
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingFault, RecordingRefused, moving_joints
+from adapter.screening.timing import unwrapped
 from drivers.files.mcap import Log
 
 ROUNDS = 2  # in which the load follows from the arm's simulated motion
@@ -54,7 +66,11 @@ DRAWS = 8  # of inertias as wrong as the documentation may be
 OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
+HAND_ROWS = 500  # of a recording, where the way of the hand is told
 ROUGH_STEP_S = 8e-3  # of the first simulations
+# what a limit, a dead band or backlash has to tell of blocks not seen, and its share of what was
+# left: simulated ones explain nearly all of it, on a real arm a wrong one explained a tenth
+LIMITED_CHI2, LIMITED_SHARE = 12.0, 0.25
 TOUCHED_S, LEAST_TOUCHED = 1.0, 2  # for so long, in so many recordings: its place is known
 
 EFFECTS = {  # what each is called, its parameter and its unit
@@ -64,6 +80,9 @@ EFFECTS = {  # what each is called, its parameter and its unit
     "coulomb_friction": ("Coulomb friction", "Fc", "N m"),
     "viscous_friction": ("viscous friction", "Fv", "N m s/rad"),
     "motor_inertia": ("motor inertia (armature)", "B", "kg m2"),
+    "servo_torque_limit": ("torque limit", "tau_max", "N m"),
+    "servo_dead_band": ("dead band", "e0", "rad"),
+    "backlash": ("backlash", "b", "rad"),
 }
 DAMPS = ("servo_velocity_gain", "viscous_friction")
 WITH_FRICTION = "velocity gain and viscous friction together: no command's speed tells them apart"
@@ -94,9 +113,11 @@ class ServoGap:
     Attributes:
         joint_names, model_name, recordings: of the arm, its model and the files.
         findings: by effect; servos: the new model.
-        before, after: (n,) rad, rms tracking error of the documented and of the new servos on what
-            the fit has not seen: recordings held out, or the last third.
+        curves: what the fit has not seen, recordings held out or the last third, by name: measured,
+            and foretold by commands alone, before by the documented and after by the new servos.
         scored: which data these are, in words.
+        hand: the frame at the hand; hand_before, hand_after: (n + 1,) m, rms by which it is off, by
+            each joint's error alone and, last, by all of them.
         scale_open: joints (from 1) whose documented masses do not show the gains' scale.
         ground: what the hand came down on beside what is documented, if anything; touched: for how
             long, s, in each recording that is fitted.
@@ -108,13 +129,25 @@ class ServoGap:
     recordings: tuple[str, ...]
     findings: tuple[ServoFinding, ...]
     servos: ServoModel
-    before: Array
-    after: Array
+    curves: tuple[tuple[str, RolloutCurves], ...]
     scored: str
+    hand: str
+    hand_before: Array
+    hand_after: Array
     scale_open: tuple[int, ...] = ()
     ground: Ground = NO_GROUND
     touched: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def before(self) -> Array:
+        """(n,) rad, rms tracking error of the documented servos, all recordings counting alike."""
+        return _rms([x.before - x.measured for _, x in self.curves])
+
+    @cached_property
+    def after(self) -> Array:
+        """(n,) rad, the same of the new servos."""
+        return _rms([x.after - x.measured for _, x in self.curves])
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +161,19 @@ class _Arm:
     ground: Ground = NO_GROUND
 
     def fixed(self, j: int) -> Array:
-        """(6,) documented parameters of a joint, as `Freedom` takes them."""
+        """(10,) documented parameters of a joint, as `Freedom` takes them."""
         servos = self.documented
         x = servos.table()[j]
         kp = servos.position_gain[j]
+        x[WITHIN] = x[WITHIN] / x[DAMPING] if x[DAMPING] > 0.0 else 0.0
         if np.isfinite(kp):
-            x[LEAD:] *= kp
-        return np.array([*x, servos.delay_s])
+            x[LEAD:DELAY] *= kp
+            x[TIGHT] /= kp
+        return x
+
+    def plain(self, j: int) -> Freedom:
+        """Of a joint of which every number is free but limits, dead band and backlash."""
+        return Freedom(ALL_FREE.free, np.where(np.arange(PARAMETERS) > DELAY, self.fixed(j), 0.0))
 
     def tasks(self, motions: Sequence[Array]) -> list[JointTask]:
         """One for each joint, all judged readings, under the loads of these motions."""
@@ -173,6 +212,7 @@ def explain(
         RecordingRefused: too short, or nothing moves. DriverError: it lacks a joint.
     """
     names = model.tree.joint_names
+    logs, hold_out = ([going_on(log, model) for log in x] for x in (logs, hold_out))
     documented = documented or ServoModel.ideal(names)
     tracks = tuple(_track(log, names) for log in logs)
     unseen = tuple(_track(log, names) for log in hold_out)
@@ -196,7 +236,11 @@ def explain(
     if ground.root > 0.0 and sum(x > TOUCHED_S for x in touched) < LEAST_TOUCHED:
         servos = replace(servos, ground=NO_GROUND)  # one motion does not tell it in other poses
     progress("foretelling what was held out")
-    before, after, scored = _scored(arm, fits, servos, unseen)
+    curves, scored = _scored(arm, fits, servos, unseen)
+    hand = hand_frame(model)
+    if hand.parent == hand.name:  # nothing rides on the last link, which may be a jaw
+        hand = next((x for x in model.frames[::-1] if x.parent in model.tree.link_names), hand)
+    place = arm.rigid, model.tree.link_names.index(hand.parent), hand.position
     found = _Table(arm)
     for j, fit in enumerate(fits):
         found.add_joint(j, fit)
@@ -209,14 +253,28 @@ def explain(
         recordings=tuple(log.path.name for log in (*logs, *hold_out)),
         findings=found.findings(),
         servos=servos,
-        before=before,
-        after=after,
+        curves=curves,
         scored=scored,
+        hand=hand.name,
+        hand_before=_hand_off(*place, [(x.measured, x.before) for _, x in curves]),
+        hand_after=_hand_off(*place, [(x.measured, x.after) for _, x in curves]),
         scale_open=tuple(found.scale_open),
         ground=ground,
         touched=touched,
         notes=(*(w for log in logs for w in log.warnings), *found.notes),
     )
+
+
+def going_on(log: Log, model: SelfModel) -> Log:
+    """A recording with positions and commands of joints that were told within one turn going on."""
+    log, own = log.select(model.tree.joint_names), model.limits
+    q, _ = unwrapped(log.q, own.lower, own.upper)
+    if log.commands is None or log.commands.q is None or not len(log.commands.q):
+        return replace(log, q=q)
+    goal, _ = unwrapped(log.commands.q, own.lower, own.upper)
+    apart = np.nanmedian(goal, axis=0) - np.nanmedian(q, axis=0)
+    turns = np.where(model.tree.slides, 0.0, np.round(apart / (2.0 * np.pi)))
+    return replace(log, q=q, commands=replace(log.commands, q=goal - 2.0 * np.pi * turns))
 
 
 def _track(log: Log, names: tuple[str, ...]) -> Track:
@@ -246,16 +304,46 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
     came down on.
     """
     tracks = tuple(Track.of(log, ROUGH_STEP_S) for log in logs)
-    tasks = replace(arm, tracks=tracks).tasks([track.smooth for track in tracks])
-    fits = [fit_joint(task, ALL_FREE, first_guess(task)) for task in tasks]
+    motions = [track.smooth for track in tracks]
+    tasks = replace(arm, tracks=tracks).tasks(motions)
+    fits = [fit_joint(task, arm.plain(j), first_guess(task)) for j, task in enumerate(tasks)]
     x = np.array([fit.x for fit in fits])
     left = np.sqrt([fit.error() / sum(map(np.sum, fit.task.rows)) for fit in fits])
     unexplained = np.sum(left > NOISE_SHARE * noise) >= LEAST_JOINTS
     if unexplained and arm.ground.root == 0.0 and np.any(arm.rigid.gravity):
         ground, x = find_ground(arm.rigid, tasks, x)
         arm = replace(arm, ground=ground)
+        tasks = replace(arm, tracks=tracks).tasks(motions)
+    fits = [
+        _limited(JointFit(task, fit.freedom, own), noise[j])
+        for j, (task, fit, own) in enumerate(zip(tasks, fits, x, strict=True))
+    ]
     tasks = arm.tasks([track.smooth for track in arm.tracks])
-    return arm, [fit_joint(task, ALL_FREE, own) for task, own in zip(tasks, x, strict=True)]
+    return arm, [fit_joint(task, fit.freedom, fit.x) for task, fit in zip(tasks, fits, strict=True)]
+
+
+def _limited(fit: JointFit, noise: float) -> JointFit:
+    """A joint's fit with what else a servo has (torque limit, dead band, backlash) where it pays.
+
+    Args:
+        noise: of the encoder, rad.
+    """
+    equation = equations(fit.task)
+    while np.sqrt(fit.error() / sum(map(np.sum, fit.task.rows))) > NOISE_SHARE * noise:
+        fits = []
+        for k, within in ((TIGHT, 0.0), (TIGHT, 1.0), (DEAD, None), (PLAY, None)):
+            if fit.freedom.free[k] or (within == 1.0 and fit.x[LEAD] > 0.0):
+                continue
+            freedom = fit.freedom.beside(k, within)
+            starts = (freedom.full(x[freedom.free]) for x in guesses(equation, fit.x, k))
+            start = min(starts, key=lambda x: misfit(fit.task.fitted(x)))
+            fits.append(fit_joint(fit.task, freedom, start))
+        best = min(fits, key=JointFit.error, default=fit)
+        least = max(LIMITED_CHI2 * best.unit, LIMITED_SHARE * fit.error())
+        if fit.error() - best.error() < least or _paid(best, fit) < LIMITED_CHI2:
+            break
+        fit = best
+    return fit
 
 
 def _motions(arm: _Arm, fits: Sequence[JointFit]) -> list[Array]:
@@ -288,9 +376,11 @@ def _with_lead(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     without = []
     for fit, x in zip(fits, start, strict=True):
         x[DAMPING] = max(fit.x[DAMPING] - fit.x[LEAD], 0.0)
-        without.append(fit_joint(fit.task, ALL_FREE.without(LEAD), x))
-    pays = sum(_paid(fit, other) for fit, other in zip(fits, without, strict=True))
-    return list(fits) if told or pays > TIE_CHI2 * len(fits) else without
+        without.append(fit_joint(fit.task, fit.freedom.without(LEAD), x))
+    # no joint alone decides it: its servo may be of another kind
+    pays = [_paid(fit, other) for fit, other in zip(fits, without, strict=True)]
+    most = TIE_CHI2 * (len(fits) - 1)
+    return list(fits) if told or np.minimum(pays, most).sum() > TIE_CHI2 * len(fits) else without
 
 
 def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
@@ -310,7 +400,8 @@ def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     left = delays - delay
     spread = float(left @ np.linalg.solve(together, left)) / max(len(fits) - 1, 1)
     std = float(np.sqrt(max(spread, 1.0) / weight.sum()))
-    if abs(delay - arm.documented.delay_s) < SURE * np.hypot(std, DOCUMENTED_DELAY_S):
+    told = not arm.documented.is_ideal  # else nobody said that there is none
+    if told and abs(delay - arm.documented.delay_s) < SURE * np.hypot(std, DOCUMENTED_DELAY_S):
         delay, std = arm.documented.delay_s, 0.0
     found = []
     for fit in fits:
@@ -341,18 +432,18 @@ def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]
     """
     j, fixed = fit.task.joint, arm.fixed(fit.task.joint)
     others = [[own[j] for own in each] for each in drawn]
-    fixed[DELAY] = fit.x[DELAY]
+    fixed[DELAY], fixed[WITHIN] = fit.x[DELAY], fit.freedom.documented[WITHIN]
     known = np.isfinite(arm.documented.position_gain[j])
     if not fit.freedom.free[LEAD] and not arm.documented.feeds_speed[j]:
         fixed[LEAD] = 0.0
     while True:
         values, covariance = physical(fit, others)
         doubt = np.sqrt(np.diagonal(covariance))
-        goal = fixed[:DELAY].copy()
+        goal = fixed[:WITHIN].copy()
         goal[A] = 1.0 / goal[A] if known else np.nan
         with np.errstate(invalid="ignore", divide="ignore"):
             far = np.abs(values - goal) / np.hypot(doubt, DOCUMENTED_SHARE * goal)
-        far[~fit.freedom.free[:DELAY]] = np.inf
+        far[~fit.freedom.free[:WITHIN]] = np.inf
         if not known:
             far[A] = np.inf
         k = int(np.nanargmin(far))
@@ -365,7 +456,10 @@ def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]
 
 
 def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Array, Array]:
-    """kp, gain of the command's speed, damping, armature, Coulomb (5,), SI, and covariance (5, 5).
+    """A servo's numbers (9,), SI, and their covariance (9, 9), in the order of the table's columns.
+
+    kp, gain of the command's speed, damping, armature, Coulomb, delay (no doubt of it), one over
+    the torque's limit, dead band, half the backlash.
 
     Args:
         others: loads of arms whose inertias are as wrong as they may be.
@@ -379,12 +473,14 @@ def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Arra
             moved = fit.moved(others)
             own = own + moved.T @ moved / len(moved)
         covariance[np.ix_(free, free)] = own * np.outer(fit.scale, fit.scale)
-    values = np.array([1.0, *x[LEAD:DELAY]]) / a
-    turn = np.zeros((DELAY, PARAMETERS))
-    turn[:, A] = -values / a
-    for k in (LEAD, DAMPING, INERTIA, RUBS):
-        turn[k, k] = 1.0 / a if fit.freedom.free[k] else 0.0
-        turn[k, A] *= fit.freedom.free[k]
+    # to the power of the gain that each has in the table
+    power = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, 0.0, 0.0])
+    values = x[:WITHIN] / a**power
+    turn = np.zeros((WITHIN, PARAMETERS))
+    turn[:, :WITHIN] = np.diag(fit.freedom.free[:WITHIN] / a**power)
+    turn[:, A] -= fit.freedom.free[:WITHIN] * power * values / a
+    values[A], turn[A] = 1.0 / a, 0.0
+    turn[A, A] = -1.0 / a**2
     return values, turn @ covariance @ turn.T
 
 
@@ -397,6 +493,8 @@ def _servos(arm: _Arm, fits: Sequence[JointFit]) -> ServoModel:
     documented = arm.documented
     gain = np.where(fed, lead * kp, np.minimum(documented.velocity_gain, damping * kp))
     gain = np.where(~fed & (documented.velocity_gain == 0.0), damping * kp, gain)
+    # what acts beside the torque's limit is friction, whoever makes it
+    gain = np.where(~fed & (x[:, TIGHT] > 0.0), x[:, WITHIN] * kp, gain)
     # A lead beyond all damping would be friction that drives: the damping is then all gain.
     return ServoModel(
         documented.joint_names,
@@ -408,35 +506,64 @@ def _servos(arm: _Arm, fits: Sequence[JointFit]) -> ServoModel:
         np.asarray(fed),
         float(np.median(x[:, DELAY])),
         arm.ground,
+        _limit(x[:, TIGHT], kp),
+        x[:, DEAD],
+        2.0 * x[:, PLAY],
     )
+
+
+def _limit(tight: Array, kp: Array) -> Array:
+    with np.errstate(divide="ignore"):
+        return np.where(tight > 0.0, kp / tight, np.inf)
 
 
 def _scored(
     arm: _Arm, fits: Sequence[JointFit], servos: ServoModel, unseen: Sequence[Track]
-) -> tuple[Array, Array, str]:
-    """Tracking errors (n,) before and after, on what the fit has not seen; and what that is."""
-    if unseen:
-        scored = f"{len(unseen)} recordings held out" if len(unseen) > 1 else "held out recording"
-        before, after = (
-            np.sqrt(np.mean([s.tracking_error(t, arm.rigid) ** 2 for t in unseen], axis=0))
-            for s in (arm.documented, servos)
-        )
-        return before, after, scored
-    fitted = []
-    for fit in fits:
-        pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
-        rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
-        fitted.append(fit_joint(replace(fit.task, rows=rows), fit.freedom, fit.x))
-    part = _servos(arm, fitted) if fitted else servos
-    errors = []
-    for s in (arm.documented, part):
-        squares = []
-        for track in arm.tracks:
-            left = track.left(s.follow(track, arm.rigid))
-            last = track.stamp_s >= FITTED_SHARE * track.stamp_s[-1]
-            squares.append(np.mean(left[last] ** 2, axis=0))
-        errors.append(np.sqrt(np.mean(squares, axis=0)))
-    return errors[0], errors[1], "last third, servos fitted before it"
+) -> tuple[tuple[tuple[str, RolloutCurves], ...], str]:
+    """Motions that the fit has not seen, by name, measured and foretold; and what they are."""
+    tracks, told = unseen, f"{len(unseen)} recordings held out"
+    if len(unseen) == 1:
+        told = "held out recording"
+    if not unseen:
+        tracks, told, fitted = arm.tracks, "last third, servos fitted before it", []
+        for fit in fits:
+            pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
+            rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
+            fitted.append(fit_joint(replace(fit.task, rows=rows), fit.freedom, fit.x))
+        servos = _servos(arm, fitted) if fitted else servos
+    found = []
+    for t in tracks:
+        take = t.judged if unseen else t.stamp_s >= FITTED_SHARE * t.stamp_s[-1]
+        ways = (t.q - t.left(s.follow(t, arm.rigid)) for s in (arm.documented, servos))
+        found.append((t.name, RolloutCurves(*(x[take] for x in (t.stamp_s, t.q, *ways)))))
+    return tuple(found), told
+
+
+def _rms(left: Sequence[Array]) -> Array:
+    """Root mean square over the rows of tables that count alike."""
+    return np.asarray(np.sqrt(np.mean([np.mean(x**2, axis=0) for x in left], axis=0)))
+
+
+def _hand_off(
+    arm: RigidArm, link: int, point: Array, pairs: Sequence[tuple[Array, Array]]
+) -> Array:
+    """(n + 1,) m, rms way of a point between two motions (m, n): by each joint alone, by all."""
+    R, o, left = np.empty((arm.n, 3, 3)), np.empty((arm.n, 3)), []
+
+    def at(q: Array) -> Array:
+        place_frames(arm.frames, q, R, o)
+        return np.asarray(o[link] + R[link] @ point)
+
+    for one, other in pairs:
+        ways = []
+        for k in range(0, len(one), max(len(one) // HAND_ROWS, 1)):
+            moved = np.tile(one[k], (arm.n + 1, 1))
+            np.fill_diagonal(moved, other[k])
+            moved[-1] = other[k]
+            here = at(one[k])
+            ways.append([np.linalg.norm(at(q) - here) for q in moved])
+        left.append(np.array(ways))
+    return _rms(left)
 
 
 class _Table:
@@ -453,7 +580,7 @@ class _Table:
 
     def add(self, effect: str, j: int, value: float, std: float, documented: float) -> None:
         """A value of joint j (from 0), where it is another one than documented."""
-        told = bool(np.isfinite(self.docs.position_gain[j]))
+        told = bool(np.isfinite(self.docs.position_gain[j]) and np.isfinite(documented))
         far = abs(value - documented) if told else value
         meant = DOCUMENTED_SHARE * max(documented, self.docs.velocity_gain[j] * (effect in DAMPS))
         if far > (SURE * np.hypot(std, meant) if told else SHOWN * std):
@@ -478,7 +605,7 @@ class _Table:
         if free[LEAD]:
             self.add("servo_velocity_gain", j, values[1], std[1], gain)
         if fit.x[LEAD] > 0.0 and (free[LEAD] or free[DAMPING]):
-            apart = np.array([0.0, -1.0, 1.0, 0.0, 0.0])
+            apart = np.eye(WITHIN)[DAMPING] - np.eye(WITHIN)[LEAD]
             doubt = float(np.sqrt(apart @ fit.doubt @ apart))
             self.add("viscous_friction", j, float(apart @ values), doubt, float(docs.viscous[j]))
         elif free[DAMPING] and gain > 0.0:
@@ -490,6 +617,13 @@ class _Table:
             self.add("motor_inertia", j, values[3], std[3], float(docs.armature[j]))
         if free[RUBS]:
             self.add("coulomb_friction", j, values[4], std[4], float(docs.coulomb[j]))
+        if free[TIGHT] and values[TIGHT] > 0.0:
+            limit, off = 1.0 / values[TIGHT], std[TIGHT] / values[TIGHT] ** 2
+            self.add("servo_torque_limit", j, limit, off, float(docs.torque_limit[j]))
+        if free[DEAD]:
+            self.add("servo_dead_band", j, values[DEAD], std[DEAD], float(docs.dead_band[j]))
+        if free[PLAY]:
+            self.add("backlash", j, 2 * values[PLAY], 2 * std[PLAY], float(docs.backlash[j]))
 
     def findings(self) -> tuple[ServoFinding, ...]:
         """By effect."""

@@ -14,16 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
-from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Load, follow_alone
+from adapter.gap.servo_kernels import (
+    DAMPING,
+    DELAY,
+    INERTIA,
+    LEAD,
+    PLAY,
+    RUBS,
+    TIGHT,
+    WITHIN,
+    A,
+    Load,
+    follow_alone,
+)
 from adapter.gap.servo_signals import Track, smoothed
 from adapter.model.spatial import Array
 
-DELAY = 5  # column after those of the servo
-PARAMETERS = 6
+PARAMETERS, PLAIN = 10, 5  # in all; those that an equation without limits has
+# where edges of limits (of the most that a motion took, at `FULL` of its rows) and of dead bands
+# (shares of rows) start, and how far beyond the latter what is driven is free of chatter
+FULL, LIMITED, DULL, BEYOND = 0.98, (1.1, 0.9, 0.7), (0.05, 0.15, 0.3, 0.5), 1.4
 LATEST_S, EVERY_S = 0.05, 1e-3  # of the delays that are tried
 BLOCK_S = 2.0  # of alternating blocks
 MEMORY_S = 0.5  # beyond which what is left of a fit does not know itself
-LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3])  # scale of a parameter that is zero
+# scale of a parameter that is zero; WITHIN follows from the others
+LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3, 0.3, 2e-4, 2e-4, 1.0])
 NUDGE = 1e-3  # of its scale, for derivatives
 OUTLIER_RAD = 5e-3  # beyond which what the model does not know is no noise
 FAR_RAD = 10.0  # at which a simulated motion that runs away is cut
@@ -47,12 +62,12 @@ class JointTask:
     rows: Sequence[NDArray[np.bool_]]
 
     def left(self, x: Array) -> list[Array]:
-        """What (6,) parameters leave of each recording's readings (k,), rad."""
+        """What (10,) parameters leave of each recording's readings (k,), rad."""
         found = []
         for track, load in zip(self.tracks, self.loads, strict=True):
             one = track.only(self.joint)
-            goal, q = one.goal(x[LEAD : LEAD + 1], x[DELAY])[:, 0], np.empty(len(one.t))
-            follow_alone(x[:DELAY], goal, load, one.start[:, 0], track.step_s, q)
+            goal, q = one.goal(x[LEAD : LEAD + 1], x[DELAY])[..., 0], np.empty(len(one.t))
+            follow_alone(x, goal, load, one.start[:, 0], track.step_s, q)
             found.append(one.left(q[:, None])[:, 0])
         return found
 
@@ -68,22 +83,34 @@ class Freedom:
     """Which parameters are free, and what the others are.
 
     Attributes:
-        free: (6,) bool.
-        documented: (6,) of the fixed ones; those between `LEAD` and `RUBS` times the position
-            gain, in SI, so that they stay what they are while the gain is sought.
+        free: (10,) bool.
+        documented: (10,) of the fixed ones; those between `LEAD` and `RUBS` times the position
+            gain, and `TIGHT` over it, in SI, so that they stay what they are while the gain is
+            sought. `WITHIN` is a share of the damping, where no command's speed is fed forward.
     """
 
     free: NDArray[np.bool_]
     documented: Array
 
     def full(self, part: Array) -> Array:
-        """(6,) from the free ones."""
+        """(10,) from the free ones."""
         x = self.documented.copy()
         x[self.free] = part
         scaled = ~self.free
-        scaled[[A, DELAY]] = False
+        scaled[[A, *range(DELAY, PARAMETERS)]] = False
         x[scaled] *= x[A]
+        if not self.free[TIGHT]:
+            x[TIGHT] /= x[A] if x[A] > 0.0 else 1.0
+        x[WITHIN] = x[LEAD] if x[LEAD] > 0.0 else x[WITHIN] * x[DAMPING]
         return x
+
+    def beside(self, k: int, within: float | None) -> Freedom:
+        """With one parameter more, and another share of the damping within the torque's limit."""
+        free, documented = self.free.copy(), self.documented.copy()
+        free[k] = True
+        if within is not None:
+            documented[WITHIN] = within
+        return Freedom(free, documented)
 
     def without(self, k: int) -> Freedom:
         """With one parameter as documented."""
@@ -92,7 +119,7 @@ class Freedom:
         return replace(self, free=free)
 
 
-ALL_FREE = Freedom(np.ones(PARAMETERS, dtype=bool), np.zeros(PARAMETERS))
+ALL_FREE = Freedom(np.arange(PARAMETERS) <= DELAY, np.zeros(PARAMETERS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,17 +127,17 @@ class JointFit:
     """A joint's servo, fitted.
 
     Attributes:
-        task, freedom: of what, and how; x: (6,).
+        task, freedom: of what, and how; x: (10,).
         delay_std: s, of the delay that all joints share.
-        values, doubt: (5,) in SI and (5, 5) their covariance, once they were weighed.
+        values, doubt: (9,) in SI and (9, 9) their covariance, once they were weighed.
     """
 
     task: JointTask
     freedom: Freedom
     x: Array
     delay_std: float = 0.0
-    values: Array = field(default_factory=lambda: np.zeros(DELAY))
-    doubt: Array = field(default_factory=lambda: np.zeros((DELAY, DELAY)))
+    values: Array = field(default_factory=lambda: np.zeros(WITHIN))
+    doubt: Array = field(default_factory=lambda: np.zeros((WITHIN, WITHIN)))
 
     @cached_property
     def scale(self) -> Array:
@@ -178,7 +205,7 @@ def blocks(task: JointTask, part: int) -> JointTask:
 
 
 def fit_joint(task: JointTask, freedom: Freedom, start: Array) -> JointFit:
-    """Fit by output error from (6,) parameters on."""
+    """Fit by output error from (10,) parameters on."""
     x = start.copy()
     scale = np.maximum(np.abs(x), LEAST)[freedom.free]
     if not freedom.free.any():
@@ -221,28 +248,77 @@ def _slopes(task: JointTask, freedom: Freedom, part: Array, scale: Array) -> Arr
 
 
 def first_guess(task: JointTask) -> Array:
-    """(6,) by equation error on smooth signals, the delay by trying."""
-    best, least, pairs = np.zeros(PARAMETERS), np.inf, zip(task.tracks, task.loads, strict=True)
-    sides = [_equation(track, load, task.joint) for track, load in pairs]
+    """(10,) by equation error on smooth signals, the delay by trying."""
+    best, least, equation = np.zeros(PARAMETERS), np.inf, equations(task)
     for delay in np.arange(0.0, LATEST_S, EVERY_S):
-        both = zip(*(side(delay) for side in sides), strict=True)
-        matrix, wanted = (np.concatenate(part) for part in both)
-        size = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-12)
-        # the triangle of all rows is as good as they are, and small
-        rows = np.asarray(np.linalg.qr(np.column_stack([matrix / size, wanted]), mode="r"))
-        x, left = nnls(rows[:, :-1], rows[:, -1])
+        matrix, wanted = equation(delay)
+        x, left = _solved(matrix[:, :PLAIN], wanted)
         if left < least:
-            least, best = left, np.array([*(x / size), delay])
+            least, best = left, np.array([*x, delay, 0.0, 0.0, 0.0, 0.0])
     return best
 
 
+def guesses(equation: Callable[[float], tuple[Array, Array]], x: Array, k: int) -> list[Array]:
+    """Starts (10,) of a fit with one number more, k, beside those that there are, x (10,).
+
+    Where a limit or a dead band acts, the equation does not hold; so the rest tells the others.
+    """
+    matrix, wanted = equation(x[DELAY])
+    if k == PLAY:
+        (*found, play), _ = _solved(matrix, wanted)
+        return [np.array([*found, *x[DELAY:PLAY], play, x[WITHIN]])]
+    asked, starts = np.abs(wanted), []
+    if k == TIGHT:  # what the joint's motion took is no more than the limit, whatever was asked
+        calm = np.abs(wanted) < np.median(np.abs(wanted))
+        x = np.array([*_solved(matrix[calm, :PLAIN], wanted[calm])[0], *x[DELAY:]])
+        x[WITHIN] = x[LEAD] if x[LEAD] > 0.0 else x[DAMPING]
+        beside = np.array([x[A], 0.0, x[DAMPING] - x[WITHIN], x[INERTIA], x[RUBS]])
+        most = float(np.quantile(np.abs(matrix[:, :PLAIN] @ beside), FULL))
+        asked = np.abs(wanted - x[LEAD] * matrix[:, LEAD] - x[WITHIN] * matrix[:, DAMPING])
+        edges = [most * share for share in LIMITED]
+    else:
+        edges = np.quantile(asked, DULL).tolist()
+    for edge in edges:
+        rows, own = asked < edge if k == TIGHT else asked > BEYOND * edge, x.copy()
+        own[:PLAIN], _ = _solved(matrix[rows, :PLAIN], wanted[rows])
+        same = x.copy()
+        own[k] = same[k] = 1.0 / max(edge, 1e-6) if k == TIGHT else edge
+        starts += [own, same]
+    return starts
+
+
+def _solved(matrix: Array, wanted: Array) -> tuple[Array, float]:
+    """Non-negative least squares, and what is left."""
+    size = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-12)
+    # the triangle of all rows is as good as they are, and small
+    rows = np.asarray(np.linalg.qr(np.column_stack([matrix / size, wanted]), mode="r"))
+    x, left = nnls(rows[:, :-1], rows[:, -1])
+    return x / size, float(left)
+
+
+def equations(task: JointTask) -> Callable[[float], tuple[Array, Array]]:
+    """Of all recordings, by the delay, see `_equation`."""
+    pairs = zip(task.tracks, task.loads, strict=True)
+    each = [_equation(track, load, task.joint) for track, load in pairs]
+
+    def at(delay: float) -> tuple[Array, Array]:
+        matrix, wanted = zip(*(one(delay) for one in each), strict=True)
+        return np.concatenate(matrix), np.concatenate(wanted)
+
+    return at
+
+
 def _equation(track: Track, load: Load, joint: int) -> Callable[[float], tuple[Array, Array]]:
-    """Of a servo, every 5 ms, by its delay: columns (m, 5) and what they are to add up to (m,)."""
+    """Of a servo, every 5 ms, by its delay: columns (m, 6) and what they are to add up to (m,).
+
+    The last column is that of half the backlash.
+    """
     period = float(np.median(np.diff(track.stamp_s)))
     one = track.only(joint)
-    command = smoothed(one.goal(np.zeros(1), 0.0), track.step_s, period)[:2, :, 0]
+    command = smoothed(one.goal(np.zeros(1), 0.0)[0], track.step_s, period)[:2, :, 0]
     q, dq, ddq = 0.5 * (track.smooth[:, 1:, joint] + track.smooth[:, :-1, joint])
-    matrix = np.zeros((len(q), 5))
+    matrix = np.zeros((len(q), PLAIN + 1))
+    matrix[:, PLAIN] = load.side
     matrix[:, A] = load.mass * ddq + load.other
     matrix[:, DAMPING], matrix[:, INERTIA], matrix[:, RUBS] = dq, ddq, np.tanh(dq / 0.01)
     middle = track.t - 0.5 * track.step_s

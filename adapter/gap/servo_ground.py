@@ -22,7 +22,6 @@ from adapter.gap.servo_fit import (
     MILLI,
     NUDGE,
     OUTLIER_RAD,
-    PARAMETERS,
     JointTask,
     blocks,
     chi2_unit,
@@ -30,7 +29,7 @@ from adapter.gap.servo_fit import (
     fit_joint,
     misfit,
 )
-from adapter.gap.servo_kernels import NO_GROUND, A, Ground
+from adapter.gap.servo_kernels import DELAY, NO_GROUND, A, Ground
 from adapter.gap.servo_signals import over_ground
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -43,6 +42,7 @@ ROUGH, FINE = 6, 30  # steps of a fit from each start, and of the best
 # what the ground explains beside the servos, on unseen blocks, of a joint that it holds: where a
 # real arm touches a table, shares of 0.68 to 0.9 on two or three joints; else on one at most
 PAYS_CHI2, PAYS_SHARE = 25.0, 0.5
+PLAIN = DELAY + 1  # numbers of each servo that are fitted along with it
 LEAST_JOINTS = 2  # that it holds: one alone may have a servo of another kind
 
 
@@ -95,41 +95,44 @@ class _Together:
 
     def fit(self, y: Array, x: Array, rounds: int) -> tuple[Array, Array, float]:
         """Ground (5,) and servos (n, 6) that explain the readings best, and what they leave."""
-        scale, usual = np.maximum(np.abs(x), LEAST), self.beyond(FAR_M)
+        scale, usual = np.maximum(np.abs(x), LEAST)[:, :PLAIN], self.beyond(FAR_M)
         units = [chi2_unit(task, own) for task, own in zip(self.tasks, x, strict=True)]
         held = MILLI * float(np.sqrt(np.median(units)))  # what a prior standard deviation weighs
         edges = np.cumsum([0, *(sum(take.sum() for take in task.rows) for task in self.tasks)])
 
+        def servos_of(z: Array) -> Array:
+            return np.hstack([z[5:].reshape(scale.shape) * scale, x[:, PLAIN:]])
+
         def left(z: Array) -> Array:
-            servos, tasks = z[5:].reshape(x.shape) * scale, self.under(self.ground(z[:5]))
+            servos, tasks = servos_of(z), self.under(self.ground(z[:5]))
             rows = [MILLI * task.fitted(own) for task, own in zip(tasks, servos, strict=True)]
             where = (z[:3] * SIZE[:3] - usual) / REACH_M
             stiff = (z[4] * SIZE[4] - 0.5 * np.log(STIFF)) / np.log(YIELDS)
             return np.concatenate([*rows, held * where, [held * stiff]])
 
         def slopes(z: Array, here: Array) -> Array:
-            servos = z[5:].reshape(x.shape) * scale
+            servos = servos_of(z)
             out = np.zeros((len(here), len(z)))
             for k in range(5):
                 out[:, k] = (left(z + NUDGE * (np.arange(len(z)) == k)) - here) / NUDGE
             for j, task in enumerate(self.under(self.ground(z[:5]))):
                 rows = slice(edges[j], edges[j + 1])
-                for k in range(PARAMETERS):
-                    step = NUDGE * scale[j, k] * (np.arange(PARAMETERS) == k)
+                for k in range(PLAIN):
+                    step = NUDGE * scale[j, k] * (np.arange(x.shape[1]) == k)
                     moved = MILLI * task.fitted(servos[j] + step)
-                    out[rows, 5 + PARAMETERS * j + k] = (moved - here[rows]) / NUDGE
+                    out[rows, 5 + PLAIN * j + k] = (moved - here[rows]) / NUDGE
             return out
 
-        least, most = np.zeros_like(x), np.full_like(x, np.inf)
+        least, most = np.zeros_like(scale), np.full_like(scale, np.inf)
         gain = float(np.median(x[:, A]))
         least[:, A], most[:, A] = gain / ALIKE, gain * ALIKE
         ends = [
             np.concatenate([np.full(5, outside), (own / scale).ravel()])
             for own, outside in ((least, -np.inf), (most, np.inf))
         ]
-        z = np.clip(np.concatenate([y, (x / scale).ravel()]), *ends)
+        z = np.clip(np.concatenate([y, (x[:, :PLAIN] / scale).ravel()]), *ends)
         z, cost = robust_fit(left, slopes, z, ends, rounds)
-        return z[:5], z[5:].reshape(x.shape) * scale, cost
+        return z[:5], servos_of(z), cost
 
     def errors(self, ground: Ground, x: Array) -> Array:
         """(n,) what servos leave of the readings that are fitted, rad², see `misfit`."""
@@ -137,7 +140,7 @@ class _Together:
         return np.array([misfit(task.fitted(own)) for task, own in pairs])
 
     def best_of(self, y: Array, servos: Sequence[Array]) -> Array:
-        """(n, 6) of several, joint by joint those that leave least."""
+        """(n, 10) of several, joint by joint those that leave least."""
         errors = np.array([self.errors(self.ground(y), x) for x in servos])
         return np.array(servos)[errors.argmin(axis=0), np.arange(self.arm.n)]
 
@@ -177,10 +180,10 @@ def robust_fit(
 
 
 def find_ground(arm: RigidArm, tasks: Sequence[JointTask], x: Array) -> tuple[Ground, Array]:
-    """What the hand comes down on, `NO_GROUND` where nothing pays, and the servos (n, 6) beside it.
+    """What the hand comes down on (`NO_GROUND` if nothing pays), and the servos (n, 10) beside it.
 
     Args:
-        tasks: of all joints, without ground; x: (n, 6) servos fitted without.
+        tasks: of all joints, without ground; x: (n, 10) servos fitted without.
     """
     best, least = None, np.inf
     # a recording in which the hand is held spoils the servos; each alone is another start

@@ -7,6 +7,9 @@ scale that only the documented masses set):
 
 with a = 1 / kp, lead the fed-forward speed's gain over kp (s), damping (s) that of the velocity
 gain and viscous friction together, inertia the armature's (s²), rubs Coulomb friction's (rad).
+A servo may drive nothing while its error is within `dead` (rad), and no harder than at an error of
+1 / tight (rad), the part `within` (s) of its damping included. A gear with backlash gives way to
+its load by `play` (rad), half of what it has: the motor, by which the servo steers, is ahead by it.
 Both simulations take the implicit midpoint rule, and friction holds a joint whose speed would
 change sign. Where the hand rests on something level, a stiff spring carries it (`Ground`).
 """
@@ -29,7 +32,9 @@ from adapter.physics.kernels import (
 
 SWEEPS, SETTLED = 60, 1e-9  # of the joints' speeds in a step; rad/s
 
-A, LEAD, DAMPING, INERTIA, RUBS = range(5)  # columns of a table of servos
+# columns of a table of servos; the delay acts on commands, before all this
+A, LEAD, DAMPING, INERTIA, RUBS, DELAY, TIGHT, DEAD, PLAY, WITHIN = range(10)
+LEAST_LOAD = 0.02  # N m, from which on a gear rests on one side of its play
 
 
 class Load(NamedTuple):
@@ -40,12 +45,14 @@ class Load(NamedTuple):
         other: the rigid torque beside mass times acceleration, N m.
         lift: what the hand rises by per rad of the joint, times the root of the ground's stiffness.
         gap: how far it is above the ground with the joint at zero, times the same.
+        side: on which side of its play the rigid torque holds the gear, -1 to 1.
     """
 
     mass: Array
     other: Array
     lift: Array
     gap: Array
+    side: Array
 
 
 class Ground(NamedTuple):
@@ -82,7 +89,7 @@ def above_ground(frames, ground, q, lift):
 
     Args:
         frames: `Frames`; ground: `Ground`; q: (n,) rad.
-        lift: (n,) what it rises by per rad of each joint, times the same, filled.
+        lift: (n,) what it rises by per rad (or m) of each joint, times the same, filled.
     """
     n = q.shape[0]
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
@@ -98,6 +105,8 @@ def above_ground(frames, ground, q, lift):
         u, v, w = x[0] - o[j, 0], x[1] - o[j, 1], x[2] - o[j, 2]
         a, b, c = R[j, 0, 2], R[j, 1, 2], R[j, 2, 2]
         risen = up[0] * (b * w - c * v) + up[1] * (c * u - a * w) + up[2] * (a * v - b * u)
+        if frames.slides[j]:
+            risen = up[0] * a + up[1] * b + up[2] * c
         lift[j] = ground.root * risen
         j = frames.parent[j]
     return ground.root * (up[0] * x[0] + up[1] * x[1] + up[2] * x[2] - ground.height)
@@ -127,20 +136,49 @@ def between(at, t, table, out):
 
 
 @jit
+def kept_back(x, error, moves, damps):
+    """What the drive of a servo x (10,) lacks, rad, in the mean of a step.
+
+    Means over a straight way, so that edges within a step come out as they are.
+
+    Args:
+        error: rad, at its beginning; moves: what the joint goes in it; damps: what damping adds.
+    """
+    after, lost = error - moves, 0.0
+    if x[DEAD] > 0.0:
+        if abs(moves) > 1e-12:
+            within, beyond = min(abs(error), x[DEAD]), min(abs(after), x[DEAD])
+            lost = 0.5 * (within * within - beyond * beyond) / moves
+        elif abs(error) < x[DEAD]:
+            lost = error
+    if x[TIGHT] > 0.0:
+        edge = 1.0 / x[TIGHT]
+        one, other = error - lost + damps, after - lost + damps
+        if abs(moves) > 1e-12:
+            over, under = max(abs(one) - edge, 0.0), max(abs(other) - edge, 0.0)
+            lost += 0.5 * (over * over - under * under) / moves
+        elif abs(one) > edge:
+            lost += one - (edge if one > 0.0 else -edge)
+    return lost
+
+
+@jit
 def follow_alone(x, goal, load, start, step, q):
     """One joint under its commands, the others' motion known.
 
     Args:
-        x: (5,) the servo.
-        goal: (m,) q_cmd + lead dq_cmd over each step, rad.
+        x: (10,) the servo.
+        goal: (2, m) q_cmd, and lead dq_cmd, over each step, rad.
         load: `Load`; start: (2,) q, dq before the first step; step: s.
         q: (m,) rad after each step, filled.
     """
     at, speed = start[0], start[1]
     damping, rubs = x[DAMPING], x[RUBS]
-    for k in range(goal.shape[0]):
+    for k in range(goal.shape[1]):
         mass = x[A] * load.mass[k] + x[INERTIA]
-        steers, holds = goal[k] - x[A] * load.other[k], 1.0
+        steers, holds = goal[0, k] - x[PLAY] * load.side[k], 1.0
+        error, damps = steers - at, goal[1, k] - x[WITHIN] * speed
+        steers += goal[1, k] - x[A] * load.other[k] - kept_back(x, error, step * speed, damps)
         if load.gap[k] + load.lift[k] * at < 0.0:
             steers -= x[A] * load.lift[k] * load.gap[k]
             holds += x[A] * load.lift[k] ** 2
@@ -168,7 +206,7 @@ def follow_together(x, goal, body, start, step, q):
     """All joints under their commands.
 
     Args:
-        x: (n, 5) the servos; goal: (m, n) as for one joint.
+        x: (n, 10) the servos; goal: (2, m, n) as for one joint.
         body: `Body`; start: (2, n) q, dq before the first step; step: s.
         q: (m, n) rad after each step, filled.
     """
@@ -178,7 +216,7 @@ def follow_together(x, goal, body, start, step, q):
     bias, column, base = np.empty(n), np.empty(n), np.zeros(12)
     mass, pull, ahead = np.empty((n, n)), np.empty(n), np.empty(n)
     before, lift = speed.copy(), np.zeros(n)
-    for k in range(goal.shape[0]):
+    for k in range(goal.shape[1]):
         above = 1.0
         if body.ground.root > 0.0:
             above = above_ground(body.frames, body.ground, at, lift)
@@ -199,8 +237,15 @@ def follow_together(x, goal, body, start, step, q):
             own = x[j, INERTIA] * speed[j]
             for i in range(n):
                 own += x[j, A] * mass[j, i] * speed[i]
-            pull[j] = 2.0 / step * own + goal[k, j] - at[j]
-            pull[j] -= x[j, A] * (bias[j] + lift[j] * above)
+            error = goal[0, k, j] - at[j]
+            pull[j] = 2.0 / step * own + goal[1, k, j] - x[j, A] * (bias[j] + lift[j] * above)
+            if x[j, PLAY] > 0.0:
+                carried = bias[j]
+                for i in range(n):
+                    carried += mass[j, i] * (speed[i] - before[i]) / step
+                error -= x[j, PLAY] * carried / np.hypot(carried, LEAST_LOAD)
+            damps = goal[1, k, j] - x[j, WITHIN] * speed[j]
+            pull[j] += error - kept_back(x[j], error, step * speed[j], damps)
         for _ in range(SWEEPS):
             change = 0.0
             for j in range(n):

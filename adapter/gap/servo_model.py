@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,15 @@ from numpy.typing import NDArray
 from adapter.errors import ModelError
 from adapter.gap.servo_kernels import (
     DAMPING,
+    DEAD,
+    DELAY,
     INERTIA,
     LEAD,
     NO_GROUND,
+    PLAY,
     RUBS,
+    TIGHT,
+    WITHIN,
     A,
     Body,
     Ground,
@@ -30,6 +35,7 @@ from adapter.physics.kernels import base_at_rest
 from adapter.physics.rigid_arm import RigidArm
 
 KEYS = ("position_gain", "velocity_gain", "coulomb", "viscous", "armature")
+LIMITS = {"torque_limit": np.inf, "dead_band": 0.0, "backlash": 0.0}  # where there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +51,9 @@ class ServoModel:
         feeds_speed: (n,) whether the velocity gain acts on the command's speed less the joint's.
             Where it does not, velocity gain and viscous friction do the same: their sum counts.
         ground: what the hand comes down on, if anything.
+        torque_limit: N m, of what both gains ask for; dead_band: rad, of an error that drives
+            nothing; backlash: rad, of the gear, from end to end, where servos steer by their
+            motors and readings are of the links.
     """
 
     joint_names: tuple[str, ...]
@@ -56,6 +65,14 @@ class ServoModel:
     feeds_speed: NDArray[np.bool_]
     delay_s: float = 0.0
     ground: Ground = NO_GROUND
+    torque_limit: Array = field(default_factory=lambda: np.array(np.inf))
+    dead_band: Array = field(default_factory=lambda: np.zeros(()))
+    backlash: Array = field(default_factory=lambda: np.zeros(()))
+
+    def __post_init__(self) -> None:
+        for key in LIMITS:  # one number for all joints, too
+            each = np.broadcast_to(getattr(self, key), len(self.joint_names))
+            object.__setattr__(self, key, np.array(each, dtype=float))
 
     @classmethod
     def ideal(cls, joint_names: tuple[str, ...]) -> ServoModel:
@@ -70,13 +87,18 @@ class ServoModel:
         return bool(np.isinf(self.position_gain).any())
 
     def table(self) -> Array:
-        """(n, 5) as the compiled simulation takes it."""
-        x = np.zeros((len(self.joint_names), 5))
+        """(n, 10) as the compiled simulation takes it."""
+        x = np.zeros((len(self.joint_names), 10))
         x[:, A] = 1.0 / self.position_gain
         x[:, LEAD] = x[:, A] * self.velocity_gain * self.feeds_speed
         x[:, DAMPING] = x[:, A] * (self.velocity_gain + self.viscous)
         x[:, INERTIA] = x[:, A] * self.armature
         x[:, RUBS] = x[:, A] * self.coulomb
+        x[:, DELAY] = self.delay_s
+        limited = np.isfinite(self.torque_limit)
+        x[limited, TIGHT] = self.position_gain[limited] / self.torque_limit[limited]
+        x[:, DEAD], x[:, PLAY] = self.dead_band, 0.5 * self.backlash
+        x[:, WITHIN] = x[:, A] * self.velocity_gain
         return x
 
     def follow(self, track: Track, arm: RigidArm) -> Array:
@@ -85,7 +107,7 @@ class ServoModel:
             return track.commanded(self.delay_s)
         x = self.table()
         goal = track.goal(x[:, LEAD], self.delay_s)
-        q = np.empty_like(goal)
+        q = np.empty_like(goal[0])
         body = Body(arm.frames, arm.theta, base_at_rest(arm.gravity), self.ground)
         follow_together(x, goal, body, track.start, track.step_s, q)
         return q
@@ -105,6 +127,11 @@ class ServoModel:
             quoted = name.replace("\\", "\\\\").replace('"', '\\"')
             lines += ["", "[[joint]]", f'name = "{quoted}"']
             lines += [f"{key} = {float(getattr(self, key)[j]):.6g}" for key in KEYS]
+            lines += [
+                f"{key} = {float(getattr(self, key)[j]):.6g}"
+                for key, none in LIMITS.items()
+                if getattr(self, key)[j] != none
+            ]
             lines.append(f"feeds_speed = {str(bool(self.feeds_speed[j])).lower()}")
         if facts := ground_facts(self.ground, self.joint_names):
             told = "what the hand comes down on: behind which joint, where in that link's frame"
@@ -138,9 +165,9 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
     if not isinstance(joints, list) or not all(isinstance(j, dict) for j in joints):
         raise ModelError(f"{path}: needs a [[joint]] for each joint, with name and {KEYS[0]}")
     strange = [key for key in facts if key not in ("delay_s", "joint", "ground")]
-    strange += [k for j in joints for k in j if k not in (*KEYS, "name", "feeds_speed")]
+    strange += [k for j in joints for k in j if k not in (*KEYS, *LIMITS, "name", "feeds_speed")]
     if strange:
-        choices = ", ".join(("delay_s", "ground", "name", *KEYS, "feeds_speed"))
+        choices = ", ".join(("delay_s", "ground", "name", *KEYS, *LIMITS, "feeds_speed"))
         raise ModelError(f"{path}: does not know {', '.join(strange)}; have: {choices}")
     told = {j.get("name"): j for j in joints}
     missing = [name for name in joint_names if name not in told]
@@ -152,6 +179,10 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
     found: dict[str, Any] = {
         key: np.array([_number(path, row, key, key == KEYS[0]) for row in rows]) for key in KEYS
     }
+    for key, none in LIMITS.items():
+        found[key] = np.array(
+            [_number(path, row, key, none > 0.0) if key in row else none for row in rows]
+        )
     found["feeds_speed"] = np.array([bool(row.get("feeds_speed", False)) for row in rows])
     if "ground" in facts:
         found["ground"] = _ground(path, facts["ground"], joint_names)

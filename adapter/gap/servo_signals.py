@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from adapter.gap.servo_kernels import Ground, Load, all_above_ground, between
+from adapter.gap.servo_kernels import LEAST_LOAD, Ground, Load, all_above_ground, between
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
@@ -87,10 +87,10 @@ class Track:
         return self.stamp_s >= EDGE_S
 
     def goal(self, lead: Array, delay_s: float) -> Array:
-        """(m, n) rad: what the servos steer to over each step, the lead's (n,) s part included."""
-        both = self.held + lead * self.gained
-        ends = np.concatenate([[0.0], self.t]) - delay_s
-        return np.ascontiguousarray(np.diff(columns(ends, self.at_s, both), axis=0) / self.step_s)
+        """(2, m, n) rad: command, and lead (n,) s times its rate, over each step."""
+        ends, tables = np.concatenate([[0.0], self.t]) - delay_s, (self.held, lead * self.gained)
+        both = [np.diff(columns(ends, self.at_s, x), axis=0) for x in tables]
+        return np.ascontiguousarray(np.array(both) / self.step_s)
 
     def commanded(self, delay_s: float) -> Array:
         """(m, n) rad: commands at the ends of the steps, between two of them by a line."""
@@ -139,7 +139,9 @@ def loads(arm: RigidArm, motion: Array, ground: Ground) -> list[Load]:
         unit = still.copy()
         unit[:, j] = 1.0
         mass = weightless.torque(q, still, unit)[:, j]
-        columns = mass, tau[:, j] - mass * ddq[:, j], lift[:, j], above - lift[:, j] * q[:, j]
+        side = tau[:, j] / np.hypot(tau[:, j], LEAST_LOAD)
+        other, gap = tau[:, j] - mass * ddq[:, j], above - lift[:, j] * q[:, j]
+        columns = mass, other, lift[:, j], gap, side
         found.append(Load(*map(np.ascontiguousarray, columns)))
     return found
 

@@ -13,7 +13,7 @@ from adapter.gap.servo_model import ground_facts
 from adapter.model.numbers import plain, plus_minus
 
 WORSE = 0.05  # share by which an error of a joint may grow, and unsaid
-LABEL = 30  # columns of a figure's name
+LABEL = 31  # columns of a figure's name
 
 
 def headline(gap: ServoGap) -> str:
@@ -24,7 +24,10 @@ def headline(gap: ServoGap) -> str:
     parts = [_short(finding) for finding in gap.findings]
     if gap.ground.root > 0.0:
         parts.insert(0, f"the hand came down on something {_height(gap)}")
-    said = f"tracking error of the worst joint {before} -> {after} ({gap.scored})"
+    hand = " -> ".join(f"{plain(1e3 * x[-1], 2)} mm" for x in (gap.hand_before, gap.hand_after))
+    said = (
+        f"tracking error of the worst joint {before} -> {after}, at the hand {hand} ({gap.scored})"
+    )
     worse = np.flatnonzero(gap.after > (1.0 + WORSE) * gap.before) + 1
     left = [f"joint {numbered(worse.tolist())}: not better"] if worse.size else []
     return "; ".join([*parts, said, *left])
@@ -35,7 +38,7 @@ def _height(gap: ServoGap) -> str:
     return f"{plain(abs(height), 2)} mm {'above' if height > 0.0 else 'below'} the base's origin"
 
 
-def _grounded(gap: ServoGap) -> str:
+def grounded(gap: ServoGap) -> str:
     """Where and for how long, and whether it is foretold with."""
     link, point = gap.joint_names[gap.ground.link], ", ".join(f"{x:.3f}" for x in gap.ground.point)
     fitted = zip(gap.recordings, gap.touched, strict=False)  # those held out come behind
@@ -78,7 +81,7 @@ def lines(gap: ServoGap) -> list[str]:
         if finding.open:
             found.append(f"  [dim]{escape(finding.open)}[/dim]")
     if gap.ground.root > 0.0:
-        found.append(f"[green]•[/green] {escape(_grounded(gap))}")
+        found.append(f"[green]•[/green] {escape(grounded(gap))}")
     if gap.scale_open:
         which = numbered(gap.scale_open)
         found.append(
@@ -90,6 +93,8 @@ def lines(gap: ServoGap) -> list[str]:
         for name, error in (
             ("tracking error before, mrad", gap.before),
             ("               after, mrad", gap.after),
+            ("at the hand before, mm, and all", gap.hand_before),
+            ("            after, mm, and all", gap.hand_after),
         )
     ]
     return found + [f"[dim]note[/dim] {escape(text)}" for text in gap.notes]
@@ -117,8 +122,18 @@ def as_json(gap: ServoGap) -> dict[str, Any]:
         "model": gap.model_name,
         "recordings": gap.recordings,
         "findings": findings,
-        "before": {"tracking_rmse_rad": gap.before},
-        "after": {"tracking_rmse_rad": gap.after},
+        "hand": gap.hand,
+        **{
+            when: {
+                "tracking_rmse_rad": error,
+                "hand_rmse_m": float(way[-1]),
+                "hand_rmse_by_joint_m": way[:-1],
+            }
+            for when, error, way in (
+                ("before", gap.before, gap.hand_before),
+                ("after", gap.after, gap.hand_after),
+            )
+        },
         "scored_on": gap.scored,
         "scale_open": gap.scale_open,
         "ground": ground_facts(gap.ground, gap.joint_names),

@@ -160,10 +160,15 @@ class Signals:
         """(k, n) rad/s velocities in the band."""
         return self.low(self.motion.dq)
 
+    @property
+    def paces(self) -> Array:
+        """(k, n) the same, of a joint that slides as if it turned a drum."""
+        return self.low_dq / self.motion.drums
+
     @cached_property
     def rests(self) -> list[tuple[int, slice]]:
         """Joints (from 0) at rest, and the rows of the band in which each is, rest by rest."""
-        still = np.abs(self.low_dq) < SMOOTHING_DQ
+        still = np.abs(self.paces) < SMOOTHING_DQ
         edges = np.diff(still.astype(int), axis=0, prepend=0, append=0)
         cuts = (np.flatnonzero(column).reshape(-1, 2) for column in edges.T)
         return [(j, slice(*cut)) for j, own in enumerate(cuts) for cut in own.tolist()]
@@ -174,7 +179,7 @@ class Signals:
 
         At rest it holds what static friction lets it: that is neither noise nor unexplained.
         """
-        return (self.heard > 0.0) & (np.abs(self.low_dq) > SMOOTHING_DQ)
+        return (self.heard > 0.0) & (np.abs(self.paces) > SMOOTHING_DQ)
 
     @property
     def sliding(self) -> Array:
@@ -184,7 +189,7 @@ class Signals:
     @cached_property
     def slowness(self) -> Array:
         """(k, n) how unsure friction is; of a rest, which holds one unknown value, so is a row."""
-        out = slowness(self.low_dq)
+        out = slowness(self.paces)
         for j, rows in self.rests:
             out[rows, j] *= math.sqrt(rows.stop - rows.start)
         return out

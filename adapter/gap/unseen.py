@@ -74,7 +74,7 @@ def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen | None:
     above = len(std) == 1 and slope[0] < 0.0  # what is stiff does not show
     if above:
         size = value((np.sqrt(asked) + SURELY) * np.sqrt(covariance[0]))
-    return Unseen(effect.name, c.joint + 1, key, float(size), effect.units()[key], bool(above))
+    return Unseen(effect.name, c.joint + 1, key, float(size), c.units[key], bool(above))
 
 
 def _beside(c: Candidate, fit: Fit) -> np.ndarray:

@@ -53,7 +53,7 @@ def headline_parts(result: GapResult) -> list[str]:
     parts = finding_parts(result.findings)
     if result.findings:
         parts += [_shrink(result), worse(result)]
-    parts += [_left(result.unexplained), *result.contradictions, stopped(result)]
+    parts += [_left(result), *result.contradictions, stopped(result)]
     return [part for part in parts if part]
 
 
@@ -85,10 +85,11 @@ def span(finding: Finding) -> str:
     return " ".join(filter(None, (where, when)))
 
 
-def leftover_sentence(leftover: Leftover) -> str:
+def leftover_sentence(leftover: Leftover, result: GapResult | None = None) -> str:
     """What stays unexplained on one joint, and what it follows."""
     followed, size = listed(list(leftover.depends_on)) or "no signal", plain(leftover.rmse_nm, 2)
-    return f"joint {leftover.joint}: {size} N m that follow {followed} {NOT_EXPLAINED}"
+    unit = result.unit("N m", leftover.joint - 1) if result is not None else "N m"
+    return f"joint {leftover.joint}: {size} {unit} that follow {followed} {NOT_EXPLAINED}"
 
 
 def rivals(findings: Sequence[Finding]) -> str:
@@ -268,10 +269,13 @@ def _shrink(result: GapResult) -> str:
         return ""
     total = fall(*(float(np.sqrt(np.sum(x[known] ** 2))) for x in (before, after)))
     seen = " (in sample only: nothing could be held out)" if result.in_sample else ""
+    unit = result.unit("N m", joint)
     if known.sum() == 1:
-        return f"torque error {total} N m{seen}"
+        return f"torque error {total} {unit}{seen}"
     worst = f"{fall(before[joint], after[joint])} of joint {joint + 1}, the worst"
-    return f"torque error {total} N m over all joints, {worst}{seen}"
+    if len({*result.slides}) > 1:  # newtons and newton metres are not added up
+        return f"torque error {worst.replace(' of', f' {unit} of')}{seen}"
+    return f"torque error {total} {unit} over all joints, {worst}{seen}"
 
 
 def worst_joint(result: GapResult) -> int | None:
@@ -303,16 +307,16 @@ def fall(before: float, after: float) -> str:
     return f"{before:.{digits}f} -> {after:.{digits}f}"
 
 
-def _left(unexplained: Sequence[Leftover]) -> str:
+def _left(result: GapResult) -> str:
     """Unexplained residuals in one clause; of each joint the largest."""
     worst: dict[int, Leftover] = {}
-    for item in sorted(unexplained, key=lambda item: item.rmse_nm):
+    for item in sorted(result.unexplained, key=lambda item: item.rmse_nm):
         worst[item.joint] = item
     if len(worst) <= 1:
-        return "".join(leftover_sentence(item) for item in worst.values())
+        return "".join(leftover_sentence(item, result) for item in worst.values())
     joints = sorted(worst)
     sizes = listed([plain(worst[j].rmse_nm, 2) for j in joints])
-    return f"joints {numbered(joints)}: {sizes} N m {NOT_EXPLAINED}"
+    return f"joints {numbered(joints)}: {sizes} {result.unit('N m')} {NOT_EXPLAINED}"
 
 
 def _instant(t: float) -> str:
@@ -332,7 +336,9 @@ def console_summary(result: GapResult) -> list[str]:
         lines += [f"  [dim]{escape(other)}[/dim]" for other in others if other]
     lines += carried(result)
     lines += [f"[red]![/red] {escape(text)}" for text in result.contradictions]
-    lines += [f"[yellow]?[/yellow] {escape(leftover_sentence(x))}" for x in result.unexplained]
+    lines += [
+        f"[yellow]?[/yellow] {escape(leftover_sentence(x, result))}" for x in result.unexplained
+    ]
     left = left_above_noise(result) if result.findings and not result.unexplained else ""
     lines += [f"[yellow]?[/yellow] {escape(left)}, and no effect of the catalogue names it"] * (
         left != ""
@@ -393,7 +399,8 @@ def _figures(result: GapResult) -> list[str]:
         (f"{result.simulator or 'rollout'} off by, before, mrad", before.rollout_rmse_rad, 1e3),
         ("       after, mrad", after.rollout_rmse_rad, 1e3),
     ]
-    return [
+    said = result.unit("N m, mrad").partition(" (")[2]
+    return [f"figures by joint, {said.removesuffix(')')} in its place"] * bool(said) + [
         f"{name:<{LABEL}} " + " ".join(f"{plain(factor * x, 3):>7}" for x in values)
         for name, values, factor in rows
         if values is not None and np.isfinite(values).any()

@@ -380,6 +380,7 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
         what_next=tuple(dict.fromkeys(splits)),
         sampled=sampling(task.fitted),
         in_sample=task.folds and not holds_out(found.fit),
+        slides=task.model.tree.slides if any(task.model.tree.slides) else (),
     )
 
 

@@ -16,9 +16,12 @@ motor inertia that the model lacks  0.1 kg m²: 5e-6 to 3e-5 kg m² at a motor b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.base import on_drum
 from adapter.effects.catalogue import LEARNED
 from adapter.model.robot_file import made_up
 from adapter.model.spatial import Array
@@ -38,20 +41,26 @@ EFFECT_STD = {  # the same, of the effects' parameters
 SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `documented_std`
 
 
-def is_shown(effect: str, key: str, std: float | None) -> bool:
-    """Whether data told a parameter of an effect, and not its prior alone."""
-    known = effect in EFFECT_STD and key == LEARNED[effect].key
-    return std is None or not known or std < 0.5 * EFFECT_STD[effect]  # or it was not shown
+def is_shown(effect: str, key: str, std: float | None, slides: bool = False) -> bool:
+    """Whether data told a parameter of an effect on a joint, and not its prior alone."""
+    if std is None or effect not in EFFECT_STD or key != LEARNED[effect].key:
+        return True
+    drum = on_drum(LEARNED[effect].unit) if slides else 1.0
+    return std < 0.5 * EFFECT_STD[effect] * drum  # or it was not shown
 
 
-def prior_std(theta: Array, share: float = DOCUMENTED_SHARE) -> Array:
+def prior_std(theta: Array, slides: Sequence[bool], share: float = DOCUMENTED_SHARE) -> Array:
     """(10 + 16 n,) of all that may be off an arm with documented inertias theta (n, 10).
+
+    What joints have that slide is that of one that turns a drum (`effects.base.DRUM_M`).
 
     Ten of the load about the last link's origin, 10 n of the links, and by joint offset, Coulomb
     and viscous friction, motor inertia, spring and static friction.
     """
     joint = (OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, MOTOR_KG_M2, SPRING_NM_RAD, STATIC_NM)
-    own = np.repeat(joint, len(theta))
+    units = "N m", "N m", "N m s/rad", "kg m2", "N m/rad", "N m"
+    each = zip(joint, units, strict=True)
+    own = np.concatenate([std * np.where(slides, on_drum(unit), 1.0) for std, unit in each])
     return np.concatenate([LOAD_STD, theta_prior(theta, share).ravel(), own])
 
 

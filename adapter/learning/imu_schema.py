@@ -43,6 +43,12 @@ class ImuSchema(Schema):
             if name not in tree.link_names:
                 have = choices(name, tree.link_names)
                 raise SettingsError(f"no link '{name}' that a sensor could be on; {have}")
+        sliding = [x for x, slides in zip(tree.joint_names, tree.slides, strict=True) if slides]
+        if sliding:
+            raise SettingsError(
+                f"joint {', '.join(sliding)} slides; from sensors on links λ is learned of joints "
+                "that turn: lock it, or leave --imu out"
+            )
         self._tree = tree
         self._links = tuple(tree.link_names.index(name) for name in settings.imus)
         if base is None:

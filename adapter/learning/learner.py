@@ -27,7 +27,7 @@ from adapter.learning.torque_rates import TorqueRates
 from adapter.learning.trace import Trace
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
-from adapter.physics.kernels import Frames, JointMotion, base_at_rest, jit, regressors
+from adapter.physics.kernels import JointMotion, base_at_rest, jit, placed, regressors
 from adapter.signals.records import StateLayout, stamp_of, stamps_of
 
 JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
@@ -528,7 +528,7 @@ class OnlineLearner:
         at, (m, n) = self.layout, error.shape
         motion = JointMotion(*(np.ascontiguousarray(table[:, x]) for x in (at.q, at.dq, at.ddq)))
         Y = np.zeros((m, n, 10 * n))
-        regressors(Frames(np.array(self.tree.parent), *self.frames), motion, self.base[None], Y)
+        regressors(placed(self.tree, *self.frames), motion, self.base[None], Y)
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
         power, seen = np.square(error / size), self.rates_seen
         new = is_new(table[:, at.dq.start : at.ddq.stop], seen)

@@ -56,7 +56,7 @@ def learned_posterior(
     links, effects = slice(20, 20 + 10 * n), slice(20 + 10 * n, None)
     told = np.isfinite(theta.believed[0])
     usual = np.array([EFFECT_STD.get(x.name, x.learned_std) for x in theta.effects])
-    own = np.where(told, theta.believed[1], usual[:, None])
+    own = np.where(told, theta.believed[1], usual[:, None] * theta.drums)
     if documented is None:
         bodies = np.tile(neutral_body(), (n, 1))
         bodies_std, load_std = np.outer(theta.body_spread[-1 - n : -1], PRIOR_STD), np.zeros(10)

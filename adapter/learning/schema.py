@@ -116,7 +116,7 @@ class Schema:
         self.R0 = np.ascontiguousarray(exp_rotation(start[:, :3]))
         self.p = np.ascontiguousarray(start[:, 3:])
         # plain tuples: numba takes 3 µs longer for a named one
-        self._frames = self._parent, self.R0, self.p
+        self._frames = self._parent, self.R0, self.p, np.array(tree.slides)
         self.start_lam = self.lam
         self.kind = LinkMotionKind.NONE  # taken from the first state that has link motion
         newest = n if each_sample or settings.forget_s is not None else 0
@@ -188,7 +188,7 @@ class Schema:
             table = table.copy()
             carry_spin(self._frames, base, table)
         keep = self._keep(1e3 * self.settings.forget_s) if self.settings.forget_s else 1.0
-        absorb(self._parent, base, table, self._moments, float(self.kind), (keep, self.weight))
+        absorb(self._frames, base, table, self._moments, float(self.kind), (keep, self.weight))
 
     def steady(self, table: Array) -> int:
         """How many states (m, size) go by until more is due than steps and looks."""

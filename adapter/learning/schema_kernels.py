@@ -7,6 +7,11 @@ For joint j with parent i, eqs. 8a, 8b and 8c multiplied by Rz(q_j) read `y = R0
     channel 1 (linear velocity)       y = Rz(q) v_j           s = [v_i, w_i]
     channel 2 (linear acceleration)   y = Rz(q) a_j           s = [a_i, dw_i, products of w_i]
 
+Of a joint that slides what its way q z along its own axis makes is known from link j alone, too:
+
+    y = w_j    y = v_j - dq z - q w_j x z
+    y = a_j - ddq z - 2 dq w_j x z - q (dw_j x z + w_j x (w_j x z))
+
 so `sum |y - R0^T z|^2` over any number of samples depends on the data only through the second
 moments of [y, s], 15 x 15 numbers at most per channel (reading notes). Small changes of a frame
 are written (phi, d): R0 <- R0 exp(phi), p <- p + d.
@@ -89,22 +94,30 @@ ROWS, AXES, SIGNS = _placed()
 
 
 @jit
-def signals(q, dq, parent_motion, motion, s):
+def signals(slides, joint, parent_motion, motion, s):
     """Fill s (3, 15) with [y, s] of each channel for one joint at one instant.
 
     Args:
-        q, dq: position and velocity of the joint, rad, rad/s.
+        slides: whether the joint slides; joint: its q, dq, ddq (ddq is used where it slides).
         parent_motion, motion: (12,) [v, w, a, dw] of link i and link j in their own frames.
     """
-    c, sn = math.cos(q), math.sin(q)
-    wz = motion[5] - dq
-    s[0, 0] = c * motion[3] - sn * motion[4]
-    s[0, 1] = sn * motion[3] + c * motion[4]
-    s[0, 2] = wz
-    for ch, o in ((1, 0), (2, 6)):
-        s[ch, 0] = c * motion[o] - sn * motion[o + 1]
-        s[ch, 1] = sn * motion[o] + c * motion[o + 1]
-        s[ch, 2] = motion[o + 2]
+    q, dq, ddq = joint
+    if slides:
+        x, y, z = motion[3], motion[4], motion[5]
+        s[0, 0], s[0, 1], s[0, 2] = x, y, z
+        s[1, 0], s[1, 1], s[1, 2] = motion[0] - q * y, motion[1] + q * x, motion[2] - dq
+        s[2, 0] = motion[6] - 2.0 * dq * y - q * (motion[10] + x * z)
+        s[2, 1] = motion[7] + 2.0 * dq * x + q * (motion[9] - y * z)
+        s[2, 2] = motion[8] - ddq + q * (x * x + y * y)
+    else:
+        c, sn = math.cos(q), math.sin(q)
+        s[0, 0] = c * motion[3] - sn * motion[4]
+        s[0, 1] = sn * motion[3] + c * motion[4]
+        s[0, 2] = motion[5] - dq
+        for ch, o in ((1, 0), (2, 6)):
+            s[ch, 0] = c * motion[o] - sn * motion[o + 1]
+            s[ch, 1] = sn * motion[o] + c * motion[o + 1]
+            s[ch, 2] = motion[o + 2]
     wx, wy, wz = parent_motion[3], parent_motion[4], parent_motion[5]
     for k in range(3):
         s[0, 3 + k] = parent_motion[3 + k]
@@ -204,18 +217,19 @@ def _add_curvature(M, R, T, TM, H):
 
 
 @jit
-def absorb(parent, base, table, moments, kind, each):
+def absorb(frames, base, table, moments, kind, each):
     """Add a table of filtered states to the moments.
 
     Args:
-        parent: (n,) int64, -1 for the base.
+        frames: `Frames` as a plain tuple; where they are plays no part.
         base: (12,) motion of a base at rest; empty where the states hold the base's motion.
         table: (m, size) states, see `records.columns`; only those whose link motion is of this
             `kind` are taken.
         moments: `MotionMoments` as a plain tuple.
         each: forgetting factor of a sample, 1 for none, and its weight.
     """
-    parent, table, moments = borrowed((parent, table, moments))
+    frames, table, moments = borrowed((frames, table, moments))
+    parent, _, _, slides = frames
     into, (keep, weight) = MotionMoments(*moments), each
     n, counts = parent.shape[0], into.counts
     at = columns(n, base.shape[0] == 0)
@@ -231,7 +245,8 @@ def absorb(parent, base, table, moments, kind, each):
             counts[Count.VELOCITIES] = 1.0
         for j in range(n):
             q, dq = table[m, at.motion_q + j], table[m, at.motion_dq + j]
-            signals(q, dq, motion[parent[j] + 1], motion[j + 1], s)
+            joint = q, dq, table[m, at.ddq + j]
+            signals(slides[j], joint, motion[parent[j] + 1], motion[j + 1], s)
             if weight != 1.0:
                 s *= math.sqrt(weight)
             accumulate(s, keep, into.M[j])
@@ -286,8 +301,10 @@ def carry_spin(frames, base, table):
             else:
                 up = table[m, at.base : at.bent]
             q, dq = table[m, at.motion_q + j], table[m, at.motion_dq + j]
-            cs = math.cos(q), math.sin(q)
             rates = dq, table[m, at.ddq + j]
+            if tree.slides[j]:
+                q, rates = 0.0, (0.0, 0.0)
+            cs = math.cos(q), math.sin(q)
             spin = (up[9], up[10], up[11])
             o[9], o[10], o[11] = link_spin(tree.R0[j], cs[0], cs[1], spin, (o[3], o[4]), rates)
 

@@ -112,7 +112,7 @@ def steps(table, parts, done):
     span_ns, waiting, buffer, bodies, which = parts[2]
     speeds, samples, recent, level, most = parts[3]
     parameters, slope, first, second, taken, adam_pace = parts[4]
-    parent, R0, p = schema.frames
+    parent, R0, p, _ = schema.frames
     known = MotionMoments(*schema.moments)
     sizes, n, begin = Rows(*theta.rows).steps, parent.shape[0], 0
     data = theta.sums[0][0], theta.sums[0][1]
@@ -122,7 +122,7 @@ def steps(table, parts, done):
         one, end = table[m : m + 1], out.ends[m]
         if m:
             each = 1.0, schema.weight
-            absorb(parent, schema.base, one, schema.moments, schema.kind, each)
+            absorb(schema.frames, schema.base, one, schema.moments, schema.kind, each)
             found = schema.gradient, schema.distance
             count = known.counts[Count.SAMPLES]
             descend(schema.frames, known.M, count, schema.inverse, *found)
@@ -130,7 +130,7 @@ def steps(table, parts, done):
         if span_ns:
             for b in range(theta.in_use.shape[0]):
                 bodies[b] = theta.th[10 * theta.in_use[b] : 10 * theta.in_use[b] + 10]
-            arm = *theta.frames, bodies, schema.base
+            arm = theta.frames, bodies, schema.base
             state = before_links[m : m + 1]
             follow_rates(arm, state, span_ns, waiting, buffer)
             for k in range(begin, end):

@@ -144,6 +144,7 @@ class Theta:
         believed: (e, n) values of the effects' parameters and their standard deviations before any
             torque, from a model; NaN where it says nothing, which is held for absent until data
             show it.
+        drums: (e, n) times which that holds, of joints of which some slide.
         effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
             body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
@@ -171,6 +172,7 @@ class Theta:
         self.hand = slice(first, first + 10)
         self.spare = slice(self._effects_from - 10, self._effects_from)
         self._parent = np.array(tree.parent, dtype=np.int64)
+        self._slides = np.array(tree.slides)
         widths = [len(effect.shapes) or 1 for effect in self.effects]
         self.columns = sum(widths)
         ends = np.cumsum(widths, dtype=int).tolist()
@@ -185,6 +187,7 @@ class Theta:
         self.count, self.weight = 0.0, 1.0
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
+        self.drums = np.array([x.drums(tree.slides) for x in self.effects]).reshape(e, n)
         nothing: Array = np.full((e, n), np.nan)
         told = believed(known.effects, settings.effects, n)
         self.believed = told or (nothing, nothing)
@@ -205,7 +208,7 @@ class Theta:
         self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
         self.rests = np.ones(n)
-        self._weigh_rests(np.repeat(np.square(self.effect_spread), n))
+        self._weigh_rests(np.square(self.effect_spread[:, None] * self.drums).ravel())
 
     @property
     def _effects_from(self) -> int:
@@ -216,7 +219,7 @@ class Theta:
         std = np.full(self.P, np.inf)
         std[: self.spare.start] = np.outer(self.body_spread[:-1], PRIOR_STD).ravel()
         told = np.isfinite(self.believed[0])
-        spread = np.where(told, self.believed[1], self.effect_spread[:, None])
+        spread = np.where(told, self.believed[1], self.effect_spread[:, None] * self.drums)
         std[self._effects_from :] = spread.ravel()
         mean = np.zeros(self.P)
         mean[: self.spare.start] = np.tile(neutral_body(), self.bodies - 1)
@@ -278,7 +281,7 @@ class Theta:
     def _absorb(
         self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
     ) -> Array:
-        columns, placed = self.effect_columns(table), (self._parent, *frames)
+        columns, placed = self.effect_columns(table), (self._parent, *frames, self._slides)
         sums = tuple(into), self._forgetting, weight, self.rests
         return absorb(placed, self._rows, self._given, table, columns, sums)
 
@@ -316,7 +319,7 @@ class Theta:
         counts = self.moments.counts
         weighing = counts, self.noise_gain, self.floor, self.floor_count, self.model_variance
         return (
-            (self._parent, *frames),
+            (self._parent, *frames, self._slides),
             self._rows,
             self._given,
             into,
@@ -504,9 +507,9 @@ class Theta:
         if not self.effects:
             return
         n = self.tree.n
-        variance = diagonal[self._effects_from :].reshape(-1, n)
+        variance = diagonal[self._effects_from :].reshape(-1, n) / self.drums**2
         widest = np.array([effect.learned_std for effect in self.effects])
-        values, free = self.effect_values, np.isnan(self.believed[0])
+        values, free = self.effect_values / self.drums, np.isnan(self.believed[0])
         shares = [
             self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
         ]
@@ -522,6 +525,7 @@ class Theta:
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(self._effects_from, self.P)
         change = np.repeat(1.0 / spread**2 - 1.0 / self.effect_spread**2, n)
+        change /= self.drums.ravel() ** 2
         self.prior[at, at] += np.where(free.ravel(), change, 0.0)
         self.effect_spread[:] = spread
         if self.settings.model_error is None:
@@ -822,7 +826,7 @@ def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
     share = np.ones(place.shape)
     for j, size in enumerate(sizes):  # nothing is known of rates at first
         share[j, size - len(owner) : size] = [not effects[k].by_rates for k in owner]
-    steps = np.repeat([effect.step for effect in effects], n)
+    steps = np.array([effect.step * effect.drums(tree.slides) for effect in effects]).ravel()
     return Rows(
         slot,
         sizes,

@@ -255,7 +255,7 @@ def sample_rows(frames, rows, given, state, effects, into):
         j = k
         while j >= 0:
             s = rows.slot[j, k]
-            axis_moment(R[j], o[j], B, z[j, s : s + 10])
+            axis_moment(R[j], o[j], frames.slides[j], B, z[j, s : s + 10])
             j = frames.parent[j]
     _take_tool_off(frames.parent, rows, given, into)
 

@@ -109,8 +109,8 @@ def model_torque(frames, theta, row, at, rest, tau):
 @jit
 def bend_all(arm, triples, bends):
     """Add those of states (t, 3, w) that follow each other; `arm` as of `follow`."""
-    parent, R0, p, theta, rest = arm
-    frames, n, six = Frames(parent, R0, p), parent.shape[0], 0 if rest.shape[0] else 6
+    placed, theta, rest = arm
+    frames, n, six = Frames(*placed), placed[0].shape[0], 0 if rest.shape[0] else 6
     at, tau = columns(n, six > 0), np.empty((3, n + six))
     for m in range(triples.shape[0]):
         for k in range(3):
@@ -125,13 +125,13 @@ def follow(arm, table, span_ns, waiting, out):
     """Take states (m, w); fill out with those that need not wait any more, and count them.
 
     Args:
-        arm: parent, R0, p, θ (bodies, 10), and the motion (12,) of a base that rests, or nothing.
+        arm: `Frames`, θ (bodies, 10), and the motion (12,) of a base that rests, or nothing.
         waiting: `Waiting`, as a plain tuple.
     """
     arm, table, waiting, out = borrowed((arm, table, waiting, out))
-    parent, R0, p, theta, rest = arm
-    frames, ring = Frames(parent, R0, p), Waiting(*waiting)
-    n, six, count = parent.shape[0], 0 if rest.shape[0] else 6, 0
+    placed, theta, rest = arm
+    frames, ring = Frames(*placed), Waiting(*waiting)
+    n, six, count = frames.parent.shape[0], 0 if rest.shape[0] else 6, 0
     at = columns(n, six > 0)
     tau = np.empty(n + six)
     for m in range(table.shape[0]):
@@ -207,6 +207,7 @@ class TorqueRates:
     def __init__(self, tree: Tree, smoothing_s: float, delay_s: float) -> None:
         layout = StateLayout(tree.n, tree.floating)
         self._parent = np.array(tree.parent, dtype=np.int64)
+        self._slides = np.array(tree.slides)
         self._width = layout.before_links.stop
         self._span_ns = round(1e9 * max(smoothing_s, 5e-3))  # where no filter was
         rows, tau = np.zeros((ROOM, self._width)), np.zeros((ROOM, tree.n))
@@ -279,5 +280,5 @@ class TorqueRates:
         """
         table = table[:, : self._width]
         out = self._one if len(table) == 1 else np.empty((ROOM + len(table), self._width))
-        arm = self._arm = self._parent, *frames, theta, base
+        arm = self._arm = (self._parent, *frames, self._slides), theta, base
         return out[: follow(arm, table, self._span_ns, tuple(self._ring), out)]

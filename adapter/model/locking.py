@@ -11,7 +11,7 @@ import numpy as np
 from adapter.errors import ModelError
 from adapter.model.inertia import move_theta
 from adapter.model.self_model import LIMITS, FixedFrame, Limits, SelfModel, Tool
-from adapter.model.spatial import Array, matrix_from_zxz, rot_z, z_to_axis, zxz_from_matrix
+from adapter.model.spatial import Array, at_joints, matrix_from_zxz, z_to_axis, zxz_from_matrix
 from adapter.model.tree import BASE, Tree
 
 LOCKED = "locked"  # entry of `SelfModel.provenance`: values of locked joints by name, rad or m
@@ -35,7 +35,7 @@ def restricted(
 
 
 def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
-    """The model with joints locked at values, rad.
+    """The model with joints locked at values, rad or m.
 
     Links and tool ride on as frames where they were, effects of locked joints are left out;
     bodies that become one have the standard deviation of their sum.
@@ -69,6 +69,7 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
         parent=tuple(number[carrier[whole.tree.parent[k]]] for k in kept),
         joint_names=tuple(whole.tree.joint_names[k] for k in kept),
         link_names=tuple(whole.tree.link_names[k] for k in kept),
+        slides=tuple(whole.tree.slides[k] for k in kept),
     )
     rows = [0, *(k + 1 for k in kept)]
     names = {whole.tree.joint_names[k]: value for k, value in at.items()}
@@ -102,8 +103,9 @@ def _carriers(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[dict[int
         carrier[k], placement[k] = k, (np.eye(3), np.zeros(3))
         if k in at:
             r, p = placement[parent]
-            turn = matrix_from_zxz(lam[k, :3]) @ rot_z(at[k])
-            carrier[k], placement[k] = carrier[parent], (r @ turn, p + r @ lam[k, 3:])
+            zero = matrix_from_zxz(lam[k, :3]), lam[k, 3:]
+            turn, place = at_joints(*zero, at[k], tree.slides[k])
+            carrier[k], placement[k] = carrier[parent], (r @ turn, p + r @ place)
     return carrier, placement
 
 

@@ -33,7 +33,7 @@ from adapter.model.urdf_text import STIFFNESS, Additions, number_text
 from adapter.model.xml_edit import Element, XmlText
 
 KINDS = ("floating", "ball", "prismatic", "revolute")  # of joints, by MuJoCo's numbers
-FREE, HINGE = 0, 3
+FREE, SLIDE, HINGE = 0, 2, 3
 EQUAL_JOINTS = 2  # MuJoCo's number of an equality of two joints' angles
 OTHER_TURNS = ("axisangle", "euler", "xyaxes", "zaxis")  # ways to turn a body beside quat
 READ_BACK = 1e-7  # of a number's scale: what MuJoCo's own arithmetic may change
@@ -156,7 +156,7 @@ class MjcfFile:
         for i in range(compiled.nbody):
             joints = self._joints_in(i)
             hinges = [j for j in joints if compiled.jnt_type[j] == HINGE]
-            if len(joints) > 1 and hinges:
+            if len(joints) > 1:
                 raise ModelError(
                     f"{path}: body '{self._name(i)}' has {len(joints)} joints; an arm's body has "
                     "one, put the others into bodies of their own"
@@ -227,9 +227,11 @@ class MjcfFile:
         for i, parent in enumerate(self._parents):
             over.append({i} | (over[parent] if i else set()))
 
+        counted = HINGE if (m.jnt_type == HINGE).any() else SLIDE
+
         def hinges(root: int) -> int:
             return sum(
-                m.jnt_type[j] == HINGE
+                m.jnt_type[j] == counted
                 for i in range(m.nbody)
                 if root in over[i]
                 for j in self._joints_in(i)
@@ -274,8 +276,9 @@ class MjcfFile:
             axis = m.jnt_axis[j].copy()
             if kind == "prismatic":
                 place = place - turn @ axis * self.zero(body)
-            if m.jnt_type[j] == HINGE:
+            if kind == "revolute":
                 turn = turn @ exp_rotation(-self.zero(body) * axis)
+            if m.jnt_type[j] in (SLIDE, HINGE):
                 limits, mimic = self._limits(j), self._followed(j)
         parent_name, own = self._name(parent), self._name(body)
         return FileJoint(name, kind, parent_name, own, turn, place, axis, limits, mimic)
@@ -337,10 +340,11 @@ class _Writer:
                 "moves it; write its pos and quat into it"
             )
         body, parent = m.body(joint.child).id, m.body(joint.parent).id
-        turned = joint.kind == "revolute"
-        back = exp_rotation(self.file.zero(body) * joint.axis) if turned else np.eye(3)
-        turn, anchor = rotation @ back, self.file.anchor
+        way, anchor = self.file.zero(body) * joint.axis, self.file.anchor
+        turn = rotation @ exp_rotation(way) if joint.kind == "revolute" else rotation
         place = position + anchor[parent] - turn @ anchor[body]
+        if joint.kind == "prismatic":
+            place = place + rotation @ way
         self.xml.set(element, "pos", number_text(place))
         self.xml.set(element, "quat", number_text(quaternion_from_matrix(turn)))
         for key in OTHER_TURNS:

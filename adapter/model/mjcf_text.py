@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from adapter.model.inertia import body_from_theta
 from adapter.model.self_model import SelfModel, base_inertia, turned_theta
-from adapter.model.spatial import Array, quaternion_from_matrix, rot_z, z_to_axis
+from adapter.model.spatial import Array, quaternion_from_matrix, z_to_axis
 from adapter.model.tree import BASE
 from adapter.model.urdf_text import (
     ARMATURE,
@@ -17,6 +17,7 @@ from adapter.model.urdf_text import (
     FRICTION,
     STIFFNESS,
     Additions,
+    at_zero,
     carried,
     check_possible,
     comment_text,
@@ -58,12 +59,13 @@ def mjcf_text(model: SelfModel, more: Additions) -> str:
         i = tree.parent[k]
         parent = tree.base_name if i == BASE else tree.link_names[i]
         turns[name] = z_to_axis(model.axis[k])
-        zero = model.joint_rotation()[k] @ rot_z(-more.offset[k])  # q = q_measured - offset
-        placed = turns[parent] @ zero @ turns[name].T, turns[parent] @ model.lam[k, 3:]
+        rotation, position = at_zero(model, more, k)
+        placed = turns[parent] @ rotation @ turns[name].T, turns[parent] @ position
         on[name] = _body(on[parent], name, *placed)
         theta = turned_theta(model.theta[k - tree.n] + more.dtheta[k], turns[name])
         on[name].append(_inertial(theta, name))
-        hinge = {"name": tree.joint_names[k], "type": "hinge", "axis": number_text(model.axis[k])}
+        kind = "slide" if tree.slides[k] else "hinge"
+        hinge = {"name": tree.joint_names[k], "type": kind, "axis": number_text(model.axis[k])}
         span = np.array([model.limits.lower[k], model.limits.upper[k]])
         if np.isfinite(span).all():
             hinge["range"] = number_text(span)

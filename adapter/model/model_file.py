@@ -104,6 +104,7 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
             "joint_names": list(tree.joint_names),
             "link_names": list(tree.link_names),
             "base_name": tree.base_name,
+            **({"slides": list(tree.slides)} if any(tree.slides) else {}),
         },
         "lambda": _numbers(model.lam),
         "lambda_std": _numbers(model.lam_std),
@@ -167,8 +168,11 @@ def _tree(data: Mapping[str, Any]) -> Tree:
     if not all(isinstance(i, int) for i in parent):
         raise ModelError("'parent' must be a list of integers")
     joints, links = _part(data, "joint_names", list, []), _part(data, "link_names", list, [])
-    base = _part(data, "base_name", str, "base")
-    return Tree(tuple(parent), floating, tuple(map(str, joints)), tuple(map(str, links)), base)
+    base, slides = _part(data, "base_name", str, "base"), _part(data, "slides", list, [])
+    if not all(isinstance(x, bool) for x in slides):
+        raise ModelError("'slides' must be a list of true and false")
+    names = tuple(map(str, joints)), tuple(map(str, links))
+    return Tree(tuple(parent), floating, *names, base, tuple(slides))
 
 
 def _frame(data: Any) -> FixedFrame:

@@ -23,7 +23,7 @@ from adapter.model.inertia import (
 from adapter.model.locking import LOCKED
 from adapter.model.robot_file import FileRobot, Merged
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array, matrix_from_zxz, rot_z, rotation_angle
+from adapter.model.spatial import Array, at_joints, matrix_from_zxz, rotation_angle
 from adapter.model.tree import BASE
 from adapter.model.urdf_text import Additions, check_possible
 
@@ -114,6 +114,8 @@ def differences(model: SelfModel, read: SelfModel) -> list[str]:
         if ours[name] != theirs_[name]:
             (p, c), (pp, cc) = ours[name], theirs_[name]
             found.append(f"joint '{name}' joins '{pp}' and '{cc}', was '{p}' and '{c}'")
+        elif model.tree.slides[k] != read.tree.slides[at[k]]:
+            found.append(f"joint '{name}' turns in one of them and slides in the other")
         elif np.abs(model.axis[k] - read.axis[at[k]]).max() > SAME_PLACE:
             found.append(f"joint '{name}' turns about {read.axis[at[k]]}, was {model.axis[k]}")
         elif model.source is not None:
@@ -148,14 +150,15 @@ def _joint_places(
 ) -> None:
     """Origins of moving joints from λ; those on the base with how the base stands."""
     robot, tilt = merged.robot, more.tilt
-    turned = model.joint_rotation() @ rot_z(-more.offset)  # q = q_measured - offset
+    at_zero = model.joint_rotation(), model.lam[:, 3:]
+    turned, placed = at_joints(*at_zero, -more.offset, model.tree.slides)  # q_measured - offset
     for joint in robot.joints.values():
         rotation, position = joint.rotation, joint.position
         if joint.name in merged.moving:
             k = model.tree.joint_names.index(joint.name)
             _, r, p = merged.place[joint.parent]
             _, own, _ = merged.place[joint.child]
-            rotation, position = r.T @ turned[k] @ own, r.T @ (model.lam[k, 3:] - p)
+            rotation, position = r.T @ turned[k] @ own, r.T @ (placed[k] - p)
         if tilt is not None and joint.parent == merged.base.name:
             rotation, position = tilt @ rotation, tilt @ position
         worst = np.abs(rotation - joint.rotation).max(), np.abs(position - joint.position).max()

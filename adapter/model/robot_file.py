@@ -1,9 +1,12 @@
 """A robot as a file describes it, and the self model in it: fixed links merged, the rest locked.
 
-The rule of the axes: the frame of a link that turns about axis u of its file's frame is that
-frame, turned by the smallest rotation Q that takes z to u (`spatial.z_to_axis`; by π about x for
-u = -z). Then Rot(u, q) = Q Rz(q) Qᵀ, and the joint turns about its own z as eq. 9 of the paper
-wants it: R_ij = Q_iᵀ R_file Q_j Rz(q), p = Q_iᵀ p_file. `urdf_text` undoes it.
+The rule of the axes: the frame of a link that turns about axis u of its file's frame, or slides
+along it, is that frame, turned by the smallest rotation Q that takes z to u (`spatial.z_to_axis`;
+by π about x for u = -z). Then Rot(u, q) = Q Rz(q) Qᵀ, and the joint turns about its own z as eq. 9
+of the paper wants it: R_ij = Q_iᵀ R_file Q_j Rz(q), p = Q_iᵀ p_file. `urdf_text` undoes it.
+
+A gripper's fingers are locked unless somebody asks for them; a joint that the recording lacks is
+locked where the two meet (`signals.matching`).
 
 Links are judged at reading: what no body has, or no motion shows. Of 106 robots' files
 (`example-robot-data`, PyBullet; 1648 links) none is told grams, and six have inertias that no body
@@ -42,7 +45,7 @@ LIGHT = 1e-3  # of the heaviest link: what changes nothing is not judged
 ROUNDED = 0.05  # of a trace, by which digits left out may make an inertia impossible (2 % seen)
 NEGATIVE, NO_SIZE = 1e-3, 1e-12  # of the largest moment, and kg m²: rounding makes less
 ALIKE, MANY = 1e-6, 3  # of the largest moment; links of an arm
-# What no torque sensor feels: N m to hold a link and turn it at 10 rad/s², with so many kg behind
+# What no sensor feels: N m (N) to hold a link and turn it at 10 rad/s², with so many kg behind
 UNFELT_NM, TURNED, UNFELT_KG = 1e-4, 10.0, 1e-3
 
 
@@ -80,20 +83,21 @@ def made_up(theta: Array) -> list[int]:
     return found.tolist() if len(found) >= MANY else []
 
 
-def check_moving(file: str, bodies: Sequence[tuple[str, str, int, Array]]) -> None:
+def check_moving(file: str, bodies: Sequence[tuple[str, str, int, Array, bool]]) -> None:
     """Judge what moves, with all that is fixed to it.
 
     Args:
         file: what messages call it.
-        bodies: link, its joint, number of the body it hangs on, and θ (10,), the joint turning
-            about z through the origin; parents first. A base that floats hangs on no joint ("").
+        bodies: link, its joint, number of the body it hangs on, θ (10,), and whether the joint
+            slides along z or turns about it, through the origin; parents first. A base that
+            floats hangs on no joint ("").
 
     Raises:
         ModelError: a principal moment of inertia is below zero: no motion can be computed.
     """
     behind, unfelt = np.zeros(len(bodies)), []
     for k in reversed(range(len(bodies))):
-        link, joint, over, theta = bodies[k]
+        link, joint, over, theta, slides = bodies[k]
         moments = np.linalg.eigvalsh(body_from_theta(theta)[2])
         if moments[0] < -max(NEGATIVE * moments[2], NO_SIZE):
             raise ModelError(
@@ -101,11 +105,12 @@ def check_moving(file: str, bodies: Sequence[tuple[str, str, int, Array]]) -> No
                 f"{moments[0]:.3g} kg m², which is below zero; correct its <inertia>"
             )
         felt = STANDARD_GRAVITY * math.hypot(theta[1], theta[2]) + TURNED * theta[9]
+        felt = STANDARD_GRAVITY * theta[0] if slides else felt
         if joint and felt < UNFELT_NM and behind[k] < UNFELT_KG:
             unfelt.append(f"'{joint}' (link '{link}' of {theta[0]:.3g} kg)")
         if over >= 0:
             behind[over] += behind[k] + theta[0]
-    balls = made_up(np.array([theta for *_, theta in bodies]).reshape(-1, 10))
+    balls = made_up(np.array([body[3] for body in bodies]).reshape(-1, 10))
     _warn(file, "somebody made up the inertias, those of a ball, of link",
           [f"'{bodies[k][0]}'" for k in balls],
           "nothing is known of a load or of the links but what logs tell")  # fmt: skip
@@ -120,6 +125,8 @@ def _warn(file: str, what: str, found: Sequence[str], do: str) -> None:
 
 TURNING = ("revolute", "continuous")
 SLIDING = ("prismatic",)
+MOVING = (*TURNING, *SLIDING)
+FINGERS = ("finger", "grip", "jaw", "claw")  # what joints of grippers are called
 
 
 @dataclass(frozen=True)
@@ -166,6 +173,14 @@ class FileRobot:
             joint = self.joints[leader]
         return factor * lock.get(joint.name, 0.0) + offset
 
+    def leader(self, joint: FileJoint) -> str:
+        """Name of the joint that one follows, be it through others; else its own."""
+        seen = {joint.name}
+        while joint.mimic is not None and joint.mimic[0] in self.joints.keys() - seen:
+            joint = self.joints[joint.mimic[0]]
+            seen.add(joint.name)
+        return joint.name
+
 
 def _root(robot: FileRobot) -> str:
     """The one link that is nobody's child; every link must hang on it, by one joint."""
@@ -198,24 +213,49 @@ def _root(robot: FileRobot) -> str:
 
 def _moving(robot: FileRobot, wanted: Sequence[str] | None, lock: Mapping[str, float]) -> set[str]:
     """Names of the joints that move in the model; warns about each that is locked unasked."""
-    free = [j.name for j in robot.joints.values() if j.kind in TURNING and j.mimic is None]
+    own = [j for j in robot.joints.values() if j.kind in MOVING and j.mimic is None]
+    free = [j.name for j in own if wanted is None and not _finger(robot, j)]
     chosen = {name for name in free if name not in lock} if wanted is None else set(wanted)
-    _check_joints(robot, chosen, TURNING, "turning joints")
-    _check_joints(robot, lock, (*TURNING, *SLIDING), "joints that can be locked")
+    _check_joints(robot, chosen, MOVING, "joints that move")
+    _check_joints(robot, lock, MOVING, "joints that can be locked")
     if chosen & lock.keys():
         both = min(chosen & lock.keys())
         raise ModelError(f"{robot.file}: joint '{both}' cannot be learned and locked; do one")
     for joint in robot.joints.values():
         if joint.name not in (*chosen, *lock) and joint.kind != "fixed":
-            value = robot.value(joint, chosen, lock)
-            follows = " and mimics another" if joint.mimic else ""
+            value, leader = robot.value(joint, chosen, lock), robot.leader(joint)
+            follows = f" and mimics {leader}" if joint.mimic else ""
+            if leader in chosen:
+                follows += (
+                    ", which moves (no model here follows; what it takes is not in its leader)"
+                )
             at = "zero" if value == 0.0 else f"{value:.6g}"
+            finger = joint in own and wanted is None
+            what = ", of a gripper as it seems (--joints A,B,... frees it)" if finger else ""
             warnings.warn(
-                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}; locked at {at}",
+                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}{what}; "
+                f"locked at {at}",
                 ModelWarning,
                 stacklevel=6,
             )
     return chosen
+
+
+def _finger(robot: FileRobot, joint: FileJoint) -> bool:
+    """Whether a joint slides a finger: it carries none that turns, and has another beside it on its
+    link, is followed by one that mimics it, or is named so."""
+    if joint.kind not in SLIDING:
+        return False
+    links, found = {joint.child}, 0
+    while len(links) > found:
+        found = len(links)
+        links |= {j.child for j in robot.joints.values() if j.parent in links}
+    every = robot.joints.values()
+    if any(j.kind in TURNING and j.parent in links and j.mimic is None for j in every):
+        return False
+    followed = any(robot.leader(j) == joint.name for j in every if j is not joint)
+    beside = sum(j.kind in SLIDING and j.parent == joint.parent for j in every) > 1
+    return followed or beside or any(word in joint.name.lower() for word in FINGERS)
 
 
 def _check_joints(robot: FileRobot, names: Iterable[str], kinds: Sequence[str], what: str) -> None:
@@ -320,8 +360,9 @@ class Merged:
                     f"{file}: moving link '{body.name}'{rest} has no mass; give it an <inertial> "
                     f"or {joint}"
                 )
-        told = [(b, b.joint.name if b.joint else "") for b in moving]
-        check_moving(file, [(b.name, j, b.parent + floating, b.theta) for b, j in told])
+        told = [(b, *((b.joint.name, b.joint.kind) if b.joint else ("", ""))) for b in moving]
+        bodies = [(b.name, j, b.parent + floating, b.theta, k in SLIDING) for b, j, k in told]
+        check_moving(file, bodies)
         check_links(file, self.robot.links)
 
     def model(self, floating: bool, gravity: Array) -> SelfModel:
@@ -343,6 +384,7 @@ class Merged:
             tuple(joint.name for joint in joints),
             tuple(body.name for body in order),
             base.name,
+            tuple(joint.kind in SLIDING for joint in joints),
         )
         theta = np.stack([body.theta for body in order])
         locked = {LOCKED: dict(self.lock)} if self.lock else {}

@@ -121,7 +121,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Limits:
-    """Joint limits, (n,) each, NaN where unknown: rad, rad, rad/s, N m."""
+    """Joint limits, (n,) each, NaN where unknown: rad, rad, rad/s, N m (m, m, m/s, N)."""
 
     lower: Array
     upper: Array
@@ -152,8 +152,8 @@ def check_limits(limits: Sequence[float], where: str) -> None:
 class SelfModel:
     """What an arm knows about its own body.
 
-    Link frames turn about their z (paper, eq. 9). A URDF joint turning about another axis has
-    its frame turned by the smallest rotation from z to that axis (`spatial.z_to_axis`); `axis`
+    Link frames turn about their z (paper, eq. 9), or slide along it. A URDF joint of another axis
+    has its frame turned by the smallest rotation from z to that axis (`spatial.z_to_axis`); `axis`
     keeps the original one, and `urdf_text` undoes the turn.
 
     Attributes:

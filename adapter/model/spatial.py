@@ -16,6 +16,17 @@ Array = NDArray[np.float64]
 EULER_SINGULAR_SINE = 1e-12
 
 
+def at_joints(R0: Array, p: Array, q: ArrayLike, slides: ArrayLike) -> tuple[Array, Array]:
+    """Frames of joints (..., 3, 3), (..., 3) at zero, where the joints stand at q (...), rad or m.
+
+    Args:
+        slides: (...) bool, joints that slide along their z; the others turn about it.
+    """
+    along = np.where(slides, q, 0.0)
+    turned: Array = R0 @ rot_z(np.where(slides, 0.0, q))
+    return turned, np.asarray(p + R0[..., :, 2] * along[..., None])
+
+
 def skew(vector: ArrayLike) -> Array:
     """The matrix [x ×] of (..., 3) vectors, (..., 3, 3): skew(a) @ b = a × b."""
     v = np.asarray(vector, dtype=np.float64)

@@ -13,7 +13,7 @@ BASE = -1
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree of N revolute joints; link k is the one that joint k moves.
+    """A tree of N joints that turn or slide; link k is the one that joint k moves.
 
     Parents come before their children. With a floating base the base is a body too: it is row 0
     of θ and its six wrench rows [f; m] (on the base, in its frame) come first in τ.
@@ -24,6 +24,8 @@ class Tree:
         joint_names: N different names; numbered ones where not given.
         link_names: N different names; numbered ones where not given.
         base_name: the name of the base link.
+        slides: for each joint whether it slides along its axis (prismatic) or turns about it; none
+            slides where not given. Its q, dq, ddq and force are then m, m/s, m/s² and N.
 
     Raises:
         ModelError: no joints, a parent that does not come earlier, names that don't fit.
@@ -34,6 +36,7 @@ class Tree:
     joint_names: tuple[str, ...] = ()
     link_names: tuple[str, ...] = ()
     base_name: str = "base"
+    slides: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.parent)
@@ -54,6 +57,9 @@ class Tree:
                 raise ModelError(f"{n} joints need {n} {kind} names, got {len(given)}")
             if len(set(given)) != n:
                 raise ModelError(f"{kind} names must differ, got {', '.join(given)}")
+        object.__setattr__(self, "slides", tuple(map(bool, self.slides)) or (False,) * n)
+        if len(self.slides) != n:
+            raise ModelError(f"{n} joints need {n} entries of slides, got {len(self.slides)}")
 
     @property
     def n(self) -> int:

@@ -15,14 +15,14 @@ from numpy.typing import ArrayLike
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.inertia import body_from_theta, move_theta, tensor_from_six, theta_from_body
 from adapter.model.onto import SAME, changes_onto
-from adapter.model.robot_file import SLIDING, TURNING, FileJoint, FileRobot, Merged
+from adapter.model.robot_file import MOVING, FileJoint, FileRobot, Merged
 from adapter.model.self_model import LIMITS, URDF, SelfModel, Source, check_limits, gravity_down
 from adapter.model.spatial import Array, matrix_from_rpy, rpy_from_matrix, vector3
 from adapter.model.urdf_text import NO_INERTIA, SIX, Additions, number_text, six_named
 from adapter.model.xml_edit import Element, XmlText
 from drivers.files.bounded import read_text
 
-JOINT_TYPES = (*TURNING, "fixed", "prismatic", "planar", "floating")
+JOINT_TYPES = (*MOVING, "fixed", "planar", "floating")
 
 
 def read_urdf(
@@ -37,8 +37,8 @@ def read_urdf(
     Args:
         path: of the file.
         joints: names of the joints wanted; all others are locked at zero with a warning. None:
-            every revolute and continuous joint (prismatic and mimicking ones locked with a
-            warning). The model's order is that of the tree, parents first.
+            every joint that turns or slides, but for a gripper's and those that mimic (locked
+            with a warning). The model's order is that of the tree, parents first.
         floating: whether the base is free.
         gravity: (3,) acceleration of gravity in base axes, m/s²; [0 0 -9.81] where None.
         lock: values of joints to be locked, rad, and m of prismatic ones; those that mimic a
@@ -181,7 +181,7 @@ def _joint(element: ET.Element, links: dict[str, Array], file: str) -> FileJoint
             raise ModelError(f"{where} names {end} '{link}'; have links: {', '.join(links)}")
         ends[end] = link
     rotation, position = origin_of(element, where)
-    axis = _axis(element, where) if kind in (*TURNING, *SLIDING) else np.array([1.0, 0.0, 0.0])
+    axis = _axis(element, where) if kind in MOVING else np.array([1.0, 0.0, 0.0])
     limits, followed, mimic = _limits(element, kind, where), element.find("mimic"), None
     if followed is not None:
         factor, offset = (
@@ -222,7 +222,7 @@ def _stated(joints: Iterable[FileJoint], file: str) -> None:
     """Check limits; a speed or effort of 0 is what many files write for one that nobody knows."""
     silent = []
     for joint in joints:
-        if joint.kind in (*TURNING, *SLIDING):
+        if joint.kind in MOVING:
             zero = joint.limits[2:] == 0.0
             silent += [joint.name] * bool(zero.any())
             joint.limits[2:][zero] = math.nan

@@ -22,7 +22,7 @@ from adapter.model.inertia import (
     six_from_tensor,
 )
 from adapter.model.self_model import LIMITS, SelfModel, base_inertia, gravity_down, turned_theta
-from adapter.model.spatial import Array, rot_z, rpy_from_matrix, z_to_axis
+from adapter.model.spatial import Array, at_joints, rpy_from_matrix, z_to_axis
 from adapter.model.tree import BASE
 
 # What a joint of a file may have beside its limits; a format has some of them.
@@ -43,9 +43,9 @@ class Additions:
     Attributes:
         n: joints; floating: whether the base is free.
         places: what a joint may have in this format.
-        joint: (n,) by place: N m s/rad, N m, kg m², N m/rad.
+        joint: (n,) by place: N m s/rad, N m, kg m², N m/rad (N s/m, N, kg, N/m of what slides).
         pull: (n,) N m, a spring's torque at q = 0.
-        offset: (n,) of the encoders, rad.
+        offset: (n,) of the encoders, rad or m.
         dtheta: (n, 10) what links weigh more than the model's θ, in their frames.
         loads: (10,) each, bodies that the last link carries, in its frame.
         tilt: (3, 3) how the base stands, None where upright.
@@ -206,6 +206,12 @@ def six_named(tensor: Array) -> dict[str, float]:
     return dict(zip(SIX, six_from_tensor(tensor).tolist(), strict=True))
 
 
+def at_zero(model: SelfModel, more: Additions, k: int) -> tuple[Array, Array]:
+    """Frame of joint k (3, 3), (3,) where its sensor says zero: q = q_measured - offset."""
+    frame = model.joint_rotation()[k], model.lam[k, 3:]
+    return at_joints(*frame, -more.offset[k], model.tree.slides[k])
+
+
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
@@ -223,10 +229,12 @@ def _add_joint(
     child = tree.link_names[k]
     bounded = bool(np.isfinite(limits.lower[k]) and np.isfinite(limits.upper[k]))
     kind = "revolute" if bounded else "continuous"
+    if tree.slides[k]:
+        kind = "prismatic"
     joint = _joint(robot, tree.joint_names[k], kind, parent, child)
-    zero = model.joint_rotation()[k] @ rot_z(-more.offset[k])  # q = q_measured - offset
-    rotation = turns[parent] @ zero @ turns[child].T
-    _add_origin(joint, rotation, turns[parent] @ model.lam[k, 3:])
+    rotation, position = at_zero(model, more, k)
+    rotation = turns[parent] @ rotation @ turns[child].T
+    _add_origin(joint, rotation, turns[parent] @ position)
     ET.SubElement(joint, "axis", xyz=number_text(model.axis[k]))
     losses = {
         place: number_text(more.joint[place][k]) for place in more.places if more.joint[place][k]
@@ -235,5 +243,7 @@ def _add_joint(
         ET.SubElement(joint, "dynamics", losses)
     values = {key: getattr(limits, key)[k] for key in LIMITS}
     known = {key: number_text(value) for key, value in values.items() if math.isfinite(value)}
+    if tree.slides[k]:  # of these the format demands both; 0 says nothing
+        known = dict.fromkeys(LIMITS[2:], "0") | known
     if known:
         ET.SubElement(joint, "limit", known)

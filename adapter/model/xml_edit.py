@@ -107,6 +107,10 @@ class XmlText:
             before = self._bytes[: found.start()]
             self._edits.append((len(before.rstrip()), found.end(), b""))
 
+    def replace(self, element: Element, text: str) -> None:
+        """Write something else in its place."""
+        self._edits.append((element.start, element.end, text.encode()))
+
     def _attribute(self, element: Element, key: str) -> re.Match[bytes] | None:
         tag_end = element.start + 1 + len(element.tag.encode())
         places = _ATTRIBUTE.finditer(self._bytes, tag_end, element.inside)

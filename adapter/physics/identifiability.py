@@ -103,7 +103,7 @@ def numerical_rank(matrix: Array, tolerance: float = RANK_TOLERANCE) -> tuple[in
 def random_motion(tree: Tree, samples: int, seed: int = 0) -> JointMotion:
     """Independent random joint states that excite everything a joint can."""
     rng = np.random.default_rng(seed)
-    q = rng.uniform(-np.pi, np.pi, (samples, tree.n))
+    q = rng.uniform(-np.pi, np.pi, (samples, tree.n))  # and as many m of what slides
     return JointMotion(q, rng.normal(size=q.shape), rng.normal(size=q.shape) * 3.0)
 
 
@@ -117,7 +117,7 @@ def random_regressor(
     motion = random_motion(tree, samples, seed)
     base = _random_base(tree, gravity, samples, seed)
     matrix = np.empty((samples, tree.rows, 10 * tree.bodies))
-    regressors(frames_of(tree.parent, lam), motion, base, matrix)
+    regressors(frames_of(tree, lam), motion, base, matrix)
     return motion, matrix if wrench else matrix[:, tree.rows - tree.n :]
 
 
@@ -162,11 +162,12 @@ def frame_observability(tree: Tree, lam: Array, gravity: Array) -> FrameObservab
     motion = random_motion(tree, 40)
     base = _random_base(tree, gravity, len(motion.q))
     links = np.empty((*motion.q.shape, 12))
-    link_motions(frames_of(tree.parent, lam), motion, base, links)
+    link_motions(frames_of(tree, lam), motion, base, links)
     bases = []
     for j, i in enumerate(tree.parent):
         parent = np.broadcast_to(base, (len(links), 12)) if i == BASE else links[:, i]
-        matrix = frame_jacobian(parent, motion.dq[:, j], np.asarray(lam)[j])
+        joint = motion.q[:, j], motion.dq[:, j]
+        matrix = frame_jacobian(parent, joint, np.asarray(lam)[j], tree.slides[j])
         _, values, rows = np.linalg.svd(matrix, full_matrices=False)
         shown = values > LEAST_SHOWN * values[0]
         bases.append(rows[shown].T if values[0] >= 1e-9 else np.zeros((6, 0)))
@@ -177,26 +178,36 @@ def frame_observability(tree: Tree, lam: Array, gravity: Array) -> FrameObservab
     return FrameObservability(sum(ranks), ranks, projectors, flags, freedom)
 
 
-def frame_jacobian(parent: Array, dq: Array, lam_j: Array) -> Array:
+def frame_jacobian(
+    parent: Array, joint: tuple[Array, Array], lam_j: Array, slides: bool = False
+) -> Array:
     """Change of link j's motion, in the parent's axes, with [turn; shift] of its frame, (.., 6).
 
     R becomes exp(φ) R: what reads Rᵀ x changes by Rᵀ [x ×] φ (eqs. 8a-8d); turning all rows into
     the parent's axes changes no rank. The parent's motion is taken as measured: by row
     operations the rank over the whole chain is the sum of the ranks found so.
 
+    A joint that slides has the lever of q z beside that of p, and 2 w_j x dq z in its acceleration.
+
     Args:
-        parent: (m, 12) motion rows of the parent; dq: (m,) of the joint; lam_j: (6,) its λ.
+        parent: (m, 12) motion rows of the parent; joint: q, dq (m,); lam_j: (6,) its λ.
+        slides: whether the joint slides.
     """
     v, w, a, dw = np.split(parent, 4, axis=1)
-    p = lam_j[3:]
-    axis = matrix_from_zxz(lam_j[:3])[:, 2]
-    zero = np.zeros((len(w), 3, 3))
-    lever = skew(dw) + skew(w) @ skew(w)
-    spin = skew(dw) - dq[:, None, None] * (skew(axis) @ skew(w))
+    p, axis = lam_j[3:], matrix_from_zxz(lam_j[:3])[:, 2]
+    zero, (q, dq) = np.zeros((len(w), 3, 3)), (x[:, None, None] for x in joint)
+    lever, across = skew(dw) + skew(w) @ skew(w), skew(axis) @ skew(w)
+    speed, pull, spin = skew(v + np.cross(w, p)), skew(a + lever @ p), skew(dw)
+    if slides:
+        bent = skew(np.cross(w, axis)) + skew(w) @ skew(axis)
+        speed = speed - q * across
+        pull = pull - q * (skew(axis) @ skew(dw) + bent @ skew(w)) - 2.0 * dq * across
+    else:
+        spin = spin - dq * across
     rows = [
-        np.concatenate([skew(v + np.cross(w, p)), skew(w)], axis=2),
+        np.concatenate([speed, skew(w)], axis=2),
         np.concatenate([skew(w), zero], axis=2),
-        np.concatenate([skew(a + lever @ p), lever], axis=2),
+        np.concatenate([pull, lever], axis=2),
         np.concatenate([spin, zero], axis=2),
     ]
     return np.concatenate(rows, axis=1).reshape(-1, 6)

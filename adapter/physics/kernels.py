@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import numba
 import numpy as np
@@ -85,26 +85,46 @@ class Frames(NamedTuple):
     Attributes:
         parent: (n,) int64, index of the link that each joint hangs on, -1 for the base.
         R0, p: (n, 3, 3) and (n, 3) m, frame j in frame i at q = 0.
+        slides: (n,) bool, joints that slide along their z; the others turn about it.
     """
 
     parent: np.ndarray
     R0: Array
     p: Array
+    slides: np.ndarray
 
 
 class JointMotion(NamedTuple):
-    """Joint angles (rad), velocities (rad/s), accelerations (rad/s²): (n,), or (m, n) in tables."""
+    """Joint angles (rad), velocities (rad/s), accelerations (rad/s²): (n,), or (m, n) in tables.
+
+    Of a joint that slides m, m/s, m/s².
+    """
 
     q: Array
     dq: Array
     ddq: Array
 
 
-def frames_of(parent: Sequence[int], lam: Array) -> Frames:
-    """The frames that λ (n, 6) describes, of a tree given by its joints' parents (n,)."""
+class Joints(Protocol):
+    """Of a tree what its frames are made of; see `model.tree.Tree`."""
+
+    @property
+    def parent(self) -> Sequence[int]: ...
+
+    @property
+    def slides(self) -> Sequence[bool]: ...
+
+
+def frames_of(tree: Joints, lam: Array) -> Frames:
+    """The frames that λ (n, 6) describes."""
     lam = np.asarray(lam, dtype=np.float64)
-    R0 = np.ascontiguousarray(matrix_from_zxz(lam[:, :3]))
-    return Frames(np.array(parent, dtype=np.int64), R0, np.ascontiguousarray(lam[:, 3:]))
+    return placed(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:])
+
+
+def placed(tree: Joints, R0: Array, p: Array) -> Frames:
+    """Frames at R0 (n, 3, 3), p (n, 3) m; these themselves where they lie in one piece."""
+    R0, p = np.ascontiguousarray(R0), np.ascontiguousarray(p)
+    return Frames(np.array(tree.parent, dtype=np.int64), R0, p, np.array(tree.slides))
 
 
 def base_at_rest(gravity: Array) -> Array:
@@ -129,36 +149,50 @@ def into_link(R, c, s, x, y, z):
 def link_motion(frames, joints, base, out):
     """Motion of every moving link, eqs. 8a to 8d (8c as in the reading notes).
 
+    Of a joint that slides: R_ij = R0_j and p_ij = p_j + q_j z; v_j has dq_j z more and a_j has
+    ddq_j z + 2 w_j x dq_j z, where eqs. 8b and 8d put dq_j and ddq_j of one that turns.
+
     Args:
         frames: `Frames`.
         joints: `JointMotion` (n,).
         base: (12,) motion row of the base.
         out: (n, 12) motion rows, filled.
     """
-    parent, R0, p = frames
+    parent, R0, p, slides = frames
     q, dq, ddq = joints
     for j in range(q.shape[0]):
         m = base if parent[j] < 0 else out[parent[j]]
         R, P, o = R0[j], p[j], out[j]
         wx, wy, wz = m[3], m[4], m[5]
         ex, ey, ez = m[9], m[10], m[11]
-        c, s = math.cos(q[j]), math.sin(q[j])
+        px, py, pz = P[0], P[1], P[2]
+        turn, spin, slide = q[j], dq[j], 0.0
+        if slides[j]:
+            turn, spin, slide = 0.0, 0.0, dq[j]
+            px, py, pz = px + R[0, 2] * q[j], py + R[1, 2] * q[j], pz + R[2, 2] * q[j]
+        c, s = math.cos(turn), math.sin(turn)
         # 8a
-        ux = m[0] + wy * P[2] - wz * P[1]
-        uy = m[1] + wz * P[0] - wx * P[2]
-        uz = m[2] + wx * P[1] - wy * P[0]
+        ux = m[0] + wy * pz - wz * py
+        uy = m[1] + wz * px - wx * pz
+        uz = m[2] + wx * py - wy * px
         o[0], o[1], o[2] = into_link(R, c, s, ux, uy, uz)
         # 8b, the parent's part first: 8d wants it
         o[3], o[4], o[5] = into_link(R, c, s, wx, wy, wz)
         # 8c, w x (w x p) written as w (w.p) - p |w|²
-        wp = wx * P[0] + wy * P[1] + wz * P[2]
+        wp = wx * px + wy * py + wz * pz
         ww = wx * wx + wy * wy + wz * wz
-        ux = m[6] + ey * P[2] - ez * P[1] + wx * wp - ww * P[0]
-        uy = m[7] + ez * P[0] - ex * P[2] + wy * wp - ww * P[1]
-        uz = m[8] + ex * P[1] - ey * P[0] + wz * wp - ww * P[2]
+        ux = m[6] + ey * pz - ez * py + wx * wp - ww * px
+        uy = m[7] + ez * px - ex * pz + wy * wp - ww * py
+        uz = m[8] + ex * py - ey * px + wz * wp - ww * pz
         o[6], o[7], o[8] = into_link(R, c, s, ux, uy, uz)
-        o[9], o[10], o[11] = link_spin(R, c, s, (ex, ey, ez), (o[3], o[4]), (dq[j], ddq[j]))
-        o[5] += dq[j]
+        spins = (spin, 0.0 if slides[j] else ddq[j])
+        o[9], o[10], o[11] = link_spin(R, c, s, (ex, ey, ez), (o[3], o[4]), spins)
+        if slides[j]:
+            o[2] += slide
+            o[6] += 2.0 * slide * o[4]
+            o[7] -= 2.0 * slide * o[3]
+            o[8] += ddq[j]
+        o[5] += spin
 
 
 @jit
@@ -178,9 +212,10 @@ def link_spin(R, c, s, dw, w, rates):
 @jit
 def place_frames(frames, q, R, o):
     """Orientation R (n, 3, 3) and origin o (n, 3) of every link frame in the base, filled."""
-    parent, R0, p = frames
+    parent, R0, p, slides = frames
     for j in range(q.shape[0]):
-        c, s = math.cos(q[j]), math.sin(q[j])
+        turn, slide = (0.0, q[j]) if slides[j] else (q[j], 0.0)
+        c, s = math.cos(turn), math.sin(turn)
         i = parent[j]
         for r in range(3):
             if i < 0:
@@ -194,7 +229,7 @@ def place_frames(frames, q, R, o):
                     z += t * R0[j, k, 2]
                     origin += t * p[j, k]
             R[j, r, 0], R[j, r, 1], R[j, r, 2] = c * x + s * y, c * y - s * x, z
-            o[j, r] = origin
+            o[j, r] = origin + slide * z
 
 
 # Wrenches of bodies: eqs. 11 to 14
@@ -285,27 +320,39 @@ def transfer_wrench(R, o, W, out):
 
 
 @jit
-def axis_line(R, o):
-    """[o x z, z], six numbers: the axis z of a joint whose frame is at R (3, 3), o (3,)."""
+def axis_line(R, o, slides):
+    """[o x z, z], six numbers: the axis z of a joint whose frame is at R (3, 3), o (3,).
+
+    Of one that `slides` [z, 0]: its force is the part of the wrench's force along z.
+    """
     x, y, z = R[0, 2], R[1, 2], R[2, 2]
-    return o[1] * z - o[2] * y, o[2] * x - o[0] * z, o[0] * y - o[1] * x, x, y, z
+    a, b, c = o[1] * z - o[2] * y, o[2] * x - o[0] * z, o[0] * y - o[1] * x
+    slide, turn = (1.0, 0.0) if slides else (0.0, 1.0)  # no branch: what calls it stays vectorised
+    return (
+        slide * x + turn * a,
+        slide * y + turn * b,
+        slide * z + turn * c,
+        turn * x,
+        turn * y,
+        turn * z,
+    )
 
 
 @jit
 def moment_about(line, w):
-    """Moment of a wrench w (6,) on the base about an axis (`axis_line`, eq. 16)."""
+    """Moment of a wrench w (6,) on the base about an axis, or its force along it (`axis_line`)."""
     force = line[0] * w[0] + line[1] * w[1] + line[2] * w[2]
     return force + line[3] * w[3] + line[4] * w[4] + line[5] * w[5]
 
 
 @jit
-def axis_moment(R, o, B, out):
-    """Moments out (k,) about a joint's axis of wrenches on the base B (6, k), one a column.
+def axis_moment(R, o, slides, B, out):
+    """What out (k,) a joint feels of wrenches on the base B (6, k), one a column (eq. 16).
 
     Args:
-        R, o: (3, 3) and (3,), the joint's frame in the base.
+        R, o: (3, 3) and (3,), the joint's frame in the base; slides: whether it slides.
     """
-    line = axis_line(R, o)
+    line = axis_line(R, o, slides)
     for i in range(B.shape[1]):
         out[i] = moment_about(line, B[:, i])
 
@@ -316,7 +363,7 @@ def axis_moment(R, o, B, out):
 
 @jit
 def inverse_dynamics(frames, theta, q, motion, base, tau):
-    """Torques that a motion takes, N m.
+    """Torques that a motion takes, N m, and N of joints that slide.
 
     Args:
         frames: `Frames`; theta: (bodies, 10).
@@ -334,7 +381,7 @@ def inverse_dynamics(frames, theta, q, motion, base, tau):
         body_wrench(motion[j], theta[first + j], own)
         transfer_one(R[j], o[j], own, total[j + 1])
     for j in range(n - 1, -1, -1):
-        tau[6 * first + j] = moment_about(axis_line(R[j], o[j]), total[j + 1])
+        tau[6 * first + j] = moment_about(axis_line(R[j], o[j], frames.slides[j]), total[j + 1])
         below = total[frames.parent[j] + 1]
         for r in range(6):
             below[r] += total[j + 1, r]
@@ -367,7 +414,7 @@ def regressor(frames, q, motion, base, Y):
             Y[:6, columns] = B
         j = k
         while j >= 0:
-            axis_moment(R[j], o[j], B, Y[6 * first + j, columns])
+            axis_moment(R[j], o[j], frames.slides[j], B, Y[6 * first + j, columns])
             j = frames.parent[j]
 
 
@@ -382,7 +429,7 @@ def momenta(frames, theta, q, dq, gravity, out):
     Args:
         frames: `Frames`; theta: (n, 10).
         q, dq: (n,) rad, rad/s; gravity: (3,) m/s² in base axes.
-        out: (3, n), filled: p N m s, dT/dq N m, g N m.
+        out: (3, n), filled: p N m s, dT/dq N m, g N m; of a joint that slides N s, N, N.
     """
     n = q.shape[0]
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
@@ -401,7 +448,7 @@ def momenta(frames, theta, q, dq, gravity, out):
         own[5] = theta[j, 1] * up[1] - theta[j, 2] * up[0]
         transfer_one(R[j], o[j], own, weight[j + 1])
     for j in range(n - 1, -1, -1):
-        line, H = axis_line(R[j], o[j]), momentum[j + 1]
+        line, H = axis_line(R[j], o[j], frames.slides[j]), momentum[j + 1]
         out[0, j] = moment_about(line, H)
         out[1, j] = energy_slope(R[j], o[j], motion[j], line, H)
         out[2, j] = moment_about(line, weight[j + 1])
@@ -498,5 +545,5 @@ def wrench_torques(frames, q, wrenches, out):
         transfer_wrench(axes, o[n - 1], wrenches, on_base)
         j = n - 1
         while j >= 0:
-            axis_moment(R[j], o[j], on_base, out[m, j])
+            axis_moment(R[j], o[j], frames.slides[j], on_base, out[m, j])
             j = frames.parent[j]

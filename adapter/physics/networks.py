@@ -8,6 +8,8 @@ the reading notes mend them:
   a_j = Rᵀ (a_i + dw_i × p_j + w_i × (w_i × p_j)). All of link j in frame j, R = R_ij.
   Accelerations `a` are those an accelerometer at the frame's origin reads (a_0 = -g on a base at
   rest), so that gravity needs no further term anywhere.
+- A joint that slides along its z has R_ij = R0 and p_ij = p + q R0 z; its dq z and ddq z stand in
+  8a and 8c, with 2 w_j x dq z, instead of in 8b and 8d, and its force is f_z where eq. 16 has m_z.
 - τ = Y θ is linear in θ. The first row of eq. 13 is w_x w_y w_z; eq. 14c sums over the links that
   hang on link j, whatever their numbers. Twists are [v; w], wrenches [f; m].
 """
@@ -27,7 +29,7 @@ from adapter.model.tree import BASE, Tree
 
 DTYPE = torch.float64
 PER_BODY = len(PARAMETERS)  # of θ, eq. 4b
-MOMENT_Z = 5  # place of the moment about the joint axis in a wrench [f; m], eq. 16
+FORCE_Z, MOMENT_Z = 2, 5  # of a wrench [f; m], what a joint that slides or turns takes, eq. 16
 
 # q, dq, ddq, (m, n) each: rad, rad/s, rad/s².
 Joints = tuple[Tensor, Tensor, Tensor]
@@ -81,32 +83,40 @@ def turn_z(q: Tensor, x: Tensor) -> Tensor:
 
 
 def link_step(
-    parent: FrameMotion, q_j: Tensor, dq_j: Tensor, ddq_j: Tensor, lam_j: Tensor
+    parent: FrameMotion, joint: Joints, lam_j: Tensor, slides: bool = False
 ) -> FrameMotion:
     """k_j(k_i, q_j, dq_j, ddq_j; λ_j): the motion of link j from that of its parent (eq. 10a).
 
     Args:
         parent: motion of link i in frame i, (m, 3) each.
-        q_j: (m,) joint angles, rad; dq_j (rad/s) and ddq_j (rad/s²) likewise.
+        joint: q_j, dq_j, ddq_j (m,): rad, rad/s, rad/s², or m, m/s, m/s².
         lam_j: (6,) λ_j = [α β γ p].
+        slides: whether it slides along its z or turns about it.
 
     Returns:
         Motion of link j in frame j, (m, 3) each.
     """
     v, w, a, dw = parent
-    p = lam_j[3:].expand_as(w)
-    r0 = joint_rotation(lam_j)
-    cross = torch.linalg.cross
+    q_j, along, ahead = joint[0], _along_z(joint[1]), _along_z(joint[2])
+    p, r0 = placed_at(q_j, lam_j, slides)
+    p, cross = p.expand_as(w), torch.linalg.cross
 
     def into_j(x: Tensor) -> Tensor:
-        return turn_z(-q_j, x @ r0)  # R_ijᵀ x, eq. 9
+        return x @ r0 if slides else turn_z(-q_j, x @ r0)  # R_ijᵀ x, eq. 9
 
     v_j = into_j(v + cross(w, p))  # 8a
-    w_i = into_j(w)
-    w_j = w_i + _along_z(dq_j)  # 8b
+    w_i = into_j(w)  # 8b
     a_j = into_j(a + cross(dw, p) + cross(w, cross(w, p)))  # 8c
-    dw_j = into_j(dw) + cross(w_i, _along_z(dq_j)) + _along_z(ddq_j)  # 8d
-    return FrameMotion(v_j, w_j, a_j, dw_j)
+    dw_i = into_j(dw)  # 8d
+    if slides:
+        return FrameMotion(v_j + along, w_i, a_j + 2.0 * cross(w_i, along) + ahead, dw_i)
+    return FrameMotion(v_j, w_i + along, a_j, dw_i + cross(w_i, along) + ahead)
+
+
+def placed_at(q_j: Tensor, lam_j: Tensor, slides: bool) -> tuple[Tensor, Tensor]:
+    """Origin of frame j in frame i, (3,) or (m, 3) where the joint slides, and R0 (3, 3)."""
+    r0 = joint_rotation(lam_j)
+    return (lam_j[3:] + q_j[:, None] * r0[:, 2] if slides else lam_j[3:]), r0
 
 
 def _along_z(x: Tensor) -> Tensor:
@@ -142,7 +152,8 @@ def link_motion(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | FrameMot
     k: list[FrameMotion] = []
     for j, i in enumerate(tree.parent):
         parent = k_base if i == BASE else k[i]
-        k.append(link_step(parent, q[:, j], dq[:, j], ddq[:, j], lam[j]))
+        joint = q[:, j], dq[:, j], ddq[:, j]
+        k.append(link_step(parent, joint, lam[j], tree.slides[j]))
     bodies = [k_base, *k] if tree.floating else k
     return FrameMotion(*(torch.stack(list(part), dim=1) for part in zip(*bodies, strict=True)))
 
@@ -175,15 +186,16 @@ def body_wrench_regressor(k: FrameMotion) -> Tensor:
     return torch.cat([force, moment], dim=-2)
 
 
-def to_parent(wrench: Tensor, q_j: Tensor, lam_j: Tensor) -> Tensor:
+def to_parent(wrench: Tensor, q_j: Tensor, lam_j: Tensor, slides: bool = False) -> Tensor:
     """T_j w: a wrench at frame j, (m, 6, ...), as one at frame i (eq. 14a)."""
-    r0 = joint_rotation(lam_j)
-    cos, sin = torch.cos(q_j), torch.sin(q_j)
-    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
-    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1)
-    rotation = r0 @ turn.reshape(-1, 3, 3)
+    p, rotation = placed_at(q_j, lam_j, slides)
+    if not slides:
+        cos, sin = torch.cos(q_j), torch.sin(q_j)
+        zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+        turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1)
+        rotation = rotation @ turn.reshape(-1, 3, 3)
     force = rotation @ wrench[:, :3]
-    return torch.cat([force, rotation @ wrench[:, 3:] + skew(lam_j[3:]) @ force], dim=1)
+    return torch.cat([force, rotation @ wrench[:, 3:] + skew(p) @ force], dim=1)
 
 
 def wrenches(tree: Tree, lam: Tensor, theta: Tensor, q: Tensor, k: FrameMotion) -> Tensor:
@@ -202,16 +214,16 @@ def wrenches(tree: Tree, lam: Tensor, theta: Tensor, q: Tensor, k: FrameMotion) 
     for j in reversed(range(tree.n)):
         i = tree.parent[j]
         if i != BASE or tree.floating:
-            on_parent = to_parent(total[j + first][..., None], q[:, j], lam[j])[..., 0]
-            total[i + first] = total[i + first] + on_parent
+            on_parent = to_parent(total[j + first][..., None], q[:, j], lam[j], tree.slides[j])
+            total[i + first] = total[i + first] + on_parent[..., 0]
     return torch.stack(total, dim=1)
 
 
 def torques(tree: Tree, wrench: Tensor) -> Tensor:
     """τ (m, rows) from wrenches (m, bodies, 6) (eq. 16); base wrench first if it floats."""
-    if tree.floating:
-        return torch.cat([wrench[:, 0], wrench[:, 1:, MOMENT_Z]], dim=1)
-    return wrench[..., MOMENT_Z]
+    first, axes = int(tree.floating), [FORCE_Z if x else MOMENT_Z for x in tree.slides]
+    own = wrench[:, range(first, tree.bodies), axes]
+    return torch.cat([wrench[:, 0], own], dim=1) if first else own
 
 
 def inverse_dynamics(
@@ -250,7 +262,7 @@ def wrench_regressors(tree: Tree, lam: Tensor, q: Tensor, k: FrameMotion) -> lis
     for j in reversed(range(tree.n)):
         i = tree.parent[j]
         if i != BASE or tree.floating:
-            above = to_parent(wide[j + first], q[:, j], lam[j])
+            above = to_parent(wide[j + first], q[:, j], lam[j], tree.slides[j])
             wide[i + first] = torch.cat([wide[i + first], above], dim=2)
     return wide
 
@@ -269,7 +281,8 @@ def regressor(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | FrameMotio
         if body < tree.bodies - tree.n:
             Y[:, :6, seen] = W
         else:
-            Y[:, body + tree.rows - tree.bodies, seen] = W[:, MOMENT_Z]
+            slides = tree.slides[body - int(tree.floating)]
+            Y[:, body + tree.rows - tree.bodies, seen] = W[:, FORCE_Z if slides else MOMENT_Z]
     return Y.flatten(2)
 
 

@@ -21,7 +21,9 @@ from adapter.physics.kernels import (
 
 @dataclass(frozen=True, eq=False)
 class RigidArm:
-    """An arm of revolute joints on a base whose motion is known: what turns motion into torque.
+    """An arm on a base whose motion is known: what turns motion into torque.
+
+    Of joints that slide q, dq, ddq are in m, m/s, m/s² and torque is a force in N.
 
     Attributes:
         frames: of its joints.
@@ -39,12 +41,17 @@ class RigidArm:
     def of(cls, model: SelfModel) -> RigidArm:
         """The rigid part of a self model with its tool."""
         theta = np.ascontiguousarray(model.theta_with_tool()[-model.tree.n :])
-        return cls(frames_of(model.tree.parent, model.lam), np.array(model.gravity), theta)
+        return cls(frames_of(model.tree, model.lam), np.array(model.gravity), theta)
 
     @property
     def n(self) -> int:
         """Number of joints."""
         return len(self.frames.parent)
+
+    @property
+    def slides(self) -> tuple[bool, ...]:
+        """Of each joint whether it slides."""
+        return tuple(self.frames.slides.tolist())
 
     def changed(self, theta: Array | None = None, gravity: Array | None = None) -> RigidArm:
         """The same arm with other inertias or another gravity."""

@@ -141,7 +141,7 @@ class FeedforwardBound:
         load[-1, 0] = mass
         self._load = ModelFeedforward(tree, documented.gravity)
         self._load.set(documented.lam, load, np.zeros((0, n)))
-        self._frames = frames_of(tree.parent, documented.lam)
+        self._frames = frames_of(tree, documented.lam)
         self._base, self._Y = base_at_rest(documented.gravity)[None], np.zeros((1, n, 10 * n))
         still = np.zeros(n)
         self.at(still, still, still, np.zeros((n, 10)))  # compiled now

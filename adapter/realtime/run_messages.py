@@ -21,15 +21,18 @@ from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import (
     Array,
+    at_joints,
+    log_rotation,
     matrix_from_zxz,
     quaternion_from_matrix,
     quaternion_product,
-    rot_z,
     z_to_axis,
 )
 from adapter.model.tree import BASE
 from adapter.model.urdf_text import URDF_PLACES, Additions, urdf_text
+from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import frame_observability
+from adapter.realtime.showing import View
 from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader
 from adapter.realtime.timing import COUNTED, LoopTiming
 from drivers.files.estimates import EstimateNames, estimate_fields
@@ -48,6 +51,15 @@ from drivers.files.ros_types import (
 
 DESCRIPTION, TF_MOVING, TF_FIXED = "/robot_description", "/tf", "/tf_static"
 WRENCH, LOAD_TOPIC, FINDINGS, TIMING_TOPIC = "/external_wrench", "/load", "/findings", "/timing"
+TOPICS = {
+    **dict.fromkeys((TF_FIXED, TF_MOVING), TF),
+    DESCRIPTION: STRING,
+    ESTIMATES: ESTIMATE,
+    WRENCH: WRENCH_STAMPED,
+    LOAD_TOPIC: LOAD,
+    FINDINGS: DIAGNOSTICS,
+    TIMING_TOPIC: TIMING,
+}
 DOCUMENTED, LEARNED = "documented", "learned"
 OK, WARN = 0, 1  # levels of a DiagnosticStatus
 WORLD = "world"
@@ -99,16 +111,19 @@ class ArmFrames:
         half_turn = quaternion_product(quaternion_product(left, about_z), right)
         self._unturned, self._half_turn = quaternion_product(left, right), half_turn
         self._p = np.einsum("jab,jb->ja", before, p)
+        slides = np.array(self._tree.slides)
+        self._along = np.einsum("jab,jb->ja", before, R0[:, :, 2]) * slides[:, None]
+        self._half = 0.5 * ~slides
 
     def rows(self, q: Array) -> Array:
-        """(n, 7) of every link in its parent at joint angles q (n,) rad."""
-        c, s = np.cos(0.5 * q)[:, None], np.sin(0.5 * q)[:, None]
+        """(n, 7) of every link in its parent at joint angles q (n,) rad, or m."""
+        c, s = np.cos(self._half * q)[:, None], np.sin(self._half * q)[:, None]
         turned = c * self._unturned + s * self._half_turn  # a product is linear in its factors
-        return _rows(self._p, turned)
+        return _rows(self._p + self._along * q[:, None], turned)
 
     def orientation_of_last(self, q: Array) -> Array:
         """(3, 3) of the last link's frame in the base's."""
-        R, turned = np.eye(3), self._R0 @ rot_z(q)
+        R, turned = np.eye(3), at_joints(self._R0, self._p, q, self._tree.slides)[0]
         for j in self._tree.path_to(self._tree.n - 1):
             R = R @ turned[j]
         return np.asarray(R @ self._axes[-1].T)
@@ -119,23 +134,6 @@ def _rows(p: Array, quaternions: Array) -> Array:
     return np.concatenate([p, quaternions[:, 1:], quaternions[:, :1]], axis=1)
 
 
-class ShownLambda:
-    """Learned joint frames as they are shown beside the documented ones.
-
-    What no motion of the links shows (how the first joint stands about gravity, where along its
-    axis the second begins) is as the learner began, anyhow. It is moved to where the
-    documentation has it, by a finite motion that changes no link's motion.
-    """
-
-    def __init__(self, model: SelfModel) -> None:
-        self._freedom = frame_observability(model.tree, model.lam, model.gravity).freedom
-        self.documented = matrix_from_zxz(model.lam[:, :3]), model.lam[:, 3:]
-
-    def frames(self, lam: Array) -> tuple[Array, Array]:
-        """R0 (n, 3, 3) and p (n, 3) m of a learned λ (n, 6)."""
-        return self._freedom.nearest(matrix_from_zxz(lam[:, :3]), lam[:, 3:], *self.documented)
-
-
 @dataclass(frozen=True)
 class ShownArm:
     """An arm that is shown as documented and as learned; picklable.
@@ -143,17 +141,36 @@ class ShownArm:
     Attributes:
         documented: the model.
         description: URDF text of it; empty where there is none.
-        shown: moves learned frames to where they compare.
+        freedom: what no motion of the links shows.
     """
 
     documented: SelfModel
     description: str
-    shown: ShownLambda
+    freedom: Freedom
 
     @classmethod
     def of(cls, documented: SelfModel) -> ShownArm:
         """From the documented model; runs compiled code, some ms."""
-        return cls(documented, description_of(documented), ShownLambda(documented))
+        seen = frame_observability(documented.tree, documented.lam, documented.gravity)
+        return cls(documented, description_of(documented), seen.freedom)
+
+
+def nearest_frames(freedom: Freedom, lam: Array, documented: Array) -> tuple[Array, Array, Array]:
+    """Learned joint frames as they are shown beside the documented ones.
+
+    What no motion of the links shows (how the first joint stands about gravity, where along its
+    axis the second begins) is as the learner began, anyhow. It is moved to where the
+    documentation has it, by a finite motion that changes no link's motion.
+
+    Args:
+        freedom: what no motion shows; lam, documented: (n, 6).
+
+    Returns:
+        R0 (n, 3, 3), p (n, 3) m, and (n, 6) how far they are off, in the parents' axes, rad and m.
+    """
+    told = matrix_from_zxz(documented[:, :3]), documented[:, 3:]
+    R, p = freedom.nearest(matrix_from_zxz(lam[:, :3]), lam[:, 3:], *told)
+    return R, p, np.hstack([log_rotation(R @ np.swapaxes(told[0], 1, 2)), p - told[1]])
 
 
 def description_of(model: SelfModel) -> str:
@@ -198,8 +215,20 @@ class RunMessages:
         self._one = TransformsEncoder(self._frames[DOCUMENTED].moving)
         self._both = TransformsEncoder([pair for frames in both for pair in frames.moving])
 
+    def seen(self, view: View, stamp_ns: int, q: Array) -> list[Message]:
+        """All that is new in a view, but for `first`; stamp and q (n,) rad of its newest state."""
+        found = list[Message]()
+        if view.snapshot is not None and view.snapshot.version:
+            found += self.estimate(view.snapshot)
+        found += self.frames(stamp_ns, q)
+        if view.push is not None:
+            found += self.push(view.push, q)
+        found += self.news(stamp_ns, view.news)
+        return found if view.timing is None else found + self.timing(stamp_ns, view.timing)
+
     def first(self, stamp_ns: int) -> list[Message]:
-        """What is said once, at the beginning."""
+        """What is said once, at the beginning; news are then told again."""
+        self._told = {}
         if self._arm is None:
             return []
         both = self._frames.values()
@@ -224,15 +253,18 @@ class RunMessages:
         """An estimate, where it is not the one told last; the learned arm is shown by it."""
         if snapshot.version == self._version:
             return []
-        self._version = snapshot.version
+        self._version, offset = snapshot.version, None
         if self._arm is not None:
-            self._frames[LEARNED].place(*self._arm.shown.frames(snapshot.lam))
+            documented = self._arm.documented.lam
+            R, p, offset = nearest_frames(self._arm.freedom, snapshot.lam, documented)
+            self._frames[LEARNED].place(R, p)
         values = {
             **{key: getattr(snapshot, key) for key in ("learned", "lambda_source")},
             "lambda_converged": snapshot.lam_converged,
             "theta_converged": snapshot.theta_converged,
             "lambda": snapshot.lam,
             "lambda_std": snapshot.lam_std,
+            "offset": offset,
             "theta": snapshot.theta,
             "theta_std": snapshot.theta_std,
             "effects": snapshot.effects,
@@ -252,7 +284,9 @@ class RunMessages:
             return []
         frames = self._frames[LEARNED if push.learned and self._version else DOCUMENTED]
         own = push.wrench.reshape(2, 3) @ frames.orientation_of_last(q)
-        fields = wrench_fields(push.stamp_ns, frames.last, own)
+        force, torque = (dict(zip("xyz", x.tolist(), strict=True)) for x in own)  # N, N m
+        fields = {"header": header(push.stamp_ns, frames.last)}
+        fields["wrench"] = {"force": force, "torque": torque}
         return [Message(WRENCH, WRENCH_STAMPED, push.stamp_ns, fields)]
 
     def news(self, stamp_ns: int, told: Mapping[str, Any]) -> list[Message]:
@@ -322,12 +356,6 @@ def _shares(found: Mapping[str, float | None]) -> dict[str, float]:
     return dict(zip(SHARE_FIELDS, values, strict=True))
 
 
-def wrench_fields(stamp_ns: int, frame: str, wrench: Array) -> dict[str, Any]:
-    """Of a WrenchStamped: (2, 3) force and torque, N and N m, in a frame's axes."""
-    both = zip(("force", "torque"), map(xyz, wrench), strict=True)
-    return {"header": header(stamp_ns, frame), "wrench": dict(both)}
-
-
 def table_fields(labels: Sequence[str], table: Array) -> dict[str, Any]:
     """Of a Float64MultiArray of any shape, a label for each dimension."""
     dim = [
@@ -335,11 +363,6 @@ def table_fields(labels: Sequence[str], table: Array) -> dict[str, Any]:
         for k, (label, size) in enumerate(zip(labels, table.shape, strict=True))
     ]
     return {"layout": {"dim": dim, "data_offset": 0}, "data": table.ravel()}
-
-
-def xyz(vector: Array) -> dict[str, float]:
-    """Of a Vector3."""
-    return dict(zip("xyz", vector.tolist(), strict=True))
 
 
 def _text(value: Any) -> str:

@@ -121,7 +121,9 @@ def _tiles(result: GapResult) -> list[Tile]:
     worst = words.worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
-        fell = f"{words.fall(first, last)} N m".replace("->", "→").replace(" ", NARROW)
+        fell = f"{words.fall(first, last)} {result.unit('N m', worst)}".replace("->", "→").replace(
+            " ", NARROW
+        )
         tiles.append(Tile("Torque error", fell, f"joint {worst + 1}, the worst; rms"))
     if worst is not None and noise[worst] > 0.0:
         times = words.noise_times(result)
@@ -129,14 +131,19 @@ def _tiles(result: GapResult) -> list[Tile]:
             Tile(
                 "In units of its noise",
                 _arrow(times[0][worst], times[1][worst], "×"),
-                tables.tied(f"joint {worst + 1}, noise {plain(noise[worst], 2)} N m"),
+                tables.tied(
+                    f"joint {worst + 1}, noise {plain(noise[worst], 2)} {result.unit('N m', worst)}"
+                ),
             )
         )
     off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
     if off is not None and np.isfinite(off).any():
         j = int(np.nanargmax(off))
         still = np.nan if off_after is None else off_after[j]
-        value, note = _arrow(1e3 * off[j], 1e3 * still, "mrad"), f"joint {j + 1}, rms within 0.5 s"
+        value, note = (
+            _arrow(1e3 * off[j], 1e3 * still, result.unit("mrad", j)),
+            f"joint {j + 1}, rms within 0.5 s",
+        )
         tiles.append(Tile("Forward simulation off by", value, tables.tied(note)))
     return tiles
 

@@ -60,14 +60,16 @@ def error_panels(result: GapResult) -> list[Panel]:
         drawing = fall_drawing(
             before.torque_rmse_nm, after.torque_rmse_nm, result.noise_floor_nm, result.joint_names
         )
-        panels.append(drawing.panel("Torque error by joint", "N m rms", "inverse dynamics"))
+        panels.append(
+            drawing.panel("Torque error by joint", result.unit("N m rms"), "inverse dynamics")
+        )
     if before.rollout_rmse_rad is not None and _any(before.rollout_rmse_rad):
         rollout = after.rollout_rmse_rad
         end = np.full(len(before.rollout_rmse_rad), np.nan) if rollout is None else rollout
         drawing = fall_drawing(1e3 * before.rollout_rmse_rad, 1e3 * end, None, result.joint_names)
         by = f" by {result.simulator}" if result.simulator else ""
         note = f"forward simulation{by}, restarted from the data every 0.5 s"
-        panels.append(drawing.panel("Position error by joint", "mrad rms", note))
+        panels.append(drawing.panel("Position error by joint", result.unit("mrad rms"), note))
     return panels
 
 
@@ -113,10 +115,6 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 @dataclass(frozen=True)
 class JointPanels:
     """Panels of one joint: clouds of its residual, and its residual and motion over time."""
@@ -156,11 +154,15 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
         clouds = []
         for key, title, label in SIGNATURES:
             x = np.concatenate([getattr(c, key)[:, j] for c in result.curves])
+            named, _, unit = label.rpartition(", ")
+            label = f"{named}, {result.unit(unit, j)}"
             cloud = _clouds(result, j, x, ("before", "after"), label)
             laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
             for finding in laws:
                 _law(cloud.axes[0], finding)
-            clouds.append(cloud.panel(title, "N m", ", ".join(f.title for f in laws)))
+            clouds.append(
+                cloud.panel(title, result.unit("N m", j), ", ".join(f.title for f in laws))
+            )
         times = [_over_time(result, j), _motion(result, j)]
         why = [result.joint_names[j]]
         said = [
@@ -268,7 +270,7 @@ def _over_time(result: GapResult, j: int) -> Panel:
     ax.plot(*_line(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
     ax.plot(*_line(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
     time_axis(drawing, "time, s")
-    return drawing.panel("Over time", "N m", f"of {curves.recording}")
+    return drawing.panel("Over time", result.unit("N m", j), f"of {curves.recording}")
 
 
 def _line(t: Array, y: Array) -> tuple[Array, Array]:
@@ -282,7 +284,9 @@ def _motion(result: GapResult, j: int) -> Panel:
     """Forward simulation of a joint against data; its torque where nothing was simulated."""
     rollout = next((r for r in result.rollouts if np.isfinite(r.before[:, j]).any()), None)
     if rollout is not None:
-        return _rollout(rollout, j)
+        start, stop = worst_window(rollout.t, rollout.before[:, j] - rollout.measured[:, j])
+        note = "position, restarted from the data every 0.5 s; below, how far it is off"
+        return rollout_drawing(rollout, j, start, stop).panel("Forward simulation", "rad", note)
     curves = result.curves[0]
     drawing = Drawing("half")
     ax, tau = drawing.axes[0], curves.tau[:, j]
@@ -290,21 +294,23 @@ def _motion(result: GapResult, j: int) -> Panel:
     for left, color in ((curves.before, GOAL), (curves.after, ACCENT)):
         ax.plot(*_line(curves.t, tau - left[:, j]), color=color, linewidth=0.9)
     time_axis(drawing, "time, s")
-    return drawing.panel("Torque, measured and predicted", "N m", f"of {curves.recording}")
+    return drawing.panel(
+        "Torque, measured and predicted", result.unit("N m", j), f"of {curves.recording}"
+    )
 
 
-def _rollout(rollout: RolloutCurves, j: int) -> Panel:
+def rollout_drawing(rollout: RolloutCurves, j: int, start: float, stop: float) -> Drawing:
+    """Motion of a joint, measured and simulated, from a time to another, and how far it is off."""
     drawing = Drawing("half", rows=(1.5, 1.0), stretch=1.0)
     above, below = drawing.axes
-    start, stop = _window(rollout, j)
     keep = (rollout.t >= start) & (rollout.t <= stop)
     t, measured = rollout.t[keep], rollout.measured[keep, j]
-    above.plot(t, measured, color=INK, linewidth=2.6, alpha=0.3)
+    above.plot(*thin(t, measured), color=INK, linewidth=2.6, alpha=0.3)
     worst = 0.0
     for simulated, color in ((rollout.before, GOAL), (rollout.after, ACCENT)):
         path = simulated[keep, j]
-        above.plot(t, path, color=color, linewidth=1.0)
-        below.plot(t, 1e3 * (path - measured), color=color, linewidth=0.9)
+        above.plot(*thin(t, path), color=color, linewidth=1.0)
+        below.plot(*thin(t, 1e3 * (path - measured)), color=color, linewidth=0.9)
         error = 1e3 * np.abs(path - measured)
         worst = max(worst, float(np.nanmax(error)) if np.isfinite(error).any() else 0.0)
     below.axhline(0.0, color=MUTED, linewidth=0.6)
@@ -318,16 +324,14 @@ def _rollout(rollout: RolloutCurves, j: int) -> Panel:
     )
     below.set_xlim(start, stop)
     time_axis(drawing, "time, s")
-    note = "position, restarted from the data every 0.5 s; below, how far it is off"
-    return drawing.panel("Forward simulation", "rad", note)
+    return drawing
 
 
-def _window(rollout: RolloutCurves, j: int) -> tuple[float, float]:
-    """The stretch of at most 10 s in which the old model is furthest off."""
-    t = rollout.t
+def worst_window(t: Array, left: Array) -> tuple[float, float]:
+    """The stretch of at most 10 s in which most is left of a joint's motion."""
     if t[-1] - t[0] <= SHOWN_ROLLOUT_S:
         return float(t[0]), float(t[-1])
-    error = np.nan_to_num(rollout.before[:, j] - rollout.measured[:, j]) ** 2
+    error = np.nan_to_num(left) ** 2
     starts = np.arange(t[0], t[-1] - SHOWN_ROLLOUT_S + 1e-9, 0.5)
     sums = [error[(t >= s) & (t <= s + SHOWN_ROLLOUT_S)].sum() for s in starts]
     start = float(starts[int(np.argmax(sums))])
@@ -344,8 +348,9 @@ def unexplained_panels(result: GapResult) -> list[Panel]:
             name, x = "t", np.concatenate([c.t for c in result.curves])
         label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
         drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
-        note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
-        panels.append(drawing.panel(f"Left on joint {item.joint}", "N m", note))
+        unit = result.unit("N m", item.joint - 1)
+        note = f"{plain(item.rmse_nm, 2)} {unit} rms, noise {plain(item.noise_floor_nm, 2)} {unit}"
+        panels.append(drawing.panel(f"Left on joint {item.joint}", unit, note))
     return panels
 
 

@@ -177,7 +177,8 @@ def error_table(result: GapResult) -> Table:
     """Errors before and after by joint: torque in N m and times its noise, rollouts in mrad."""
     before, after = result.before, result.after
     heads = ["Joint", "Noise", *["Before", "After"] * 2]
-    units = ["", "N m", *["torque, N m"] * 2, *["× noise"] * 2]
+    own = result.unit("N m")
+    units = ["", own, *[f"torque, {own}"] * 2, *["× noise"] * 2]
     noise = np.asarray(result.noise_floor_nm, dtype=float)
     columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *noise_times(result)]
     for unit, key in (
@@ -190,7 +191,7 @@ def error_table(result: GapResult) -> Table:
         nothing = np.full(len(noise), np.nan)
         columns += [nothing if x is None else 1e3 * np.asarray(x, dtype=float) for x in pair]
         heads += ["Before", "After"]
-        units += [unit, unit]
+        units += [result.unit(unit)] * 2
     rows = [[name, *(plain(x[j]) for x in columns)] for j, name in enumerate(result.joint_names)]
     return Table(heads, rows, units, "× noise: in its band, where the joint slides.")
 

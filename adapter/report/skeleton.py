@@ -11,7 +11,7 @@ import numpy as np
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
-from adapter.physics.kernels import Frames, place_frames
+from adapter.physics.kernels import place_frames, placed
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
 from adapter.runs.run_folder import RunData
 
@@ -103,7 +103,7 @@ def skeleton_of(
         frames: that ride on links; the farthest one of an outermost link is its tip.
     """
     R, p = np.empty((tree.n, 3, 3)), np.empty((tree.n, 3))
-    place_frames(Frames(np.array(tree.parent), R0, np.ascontiguousarray(p0)), q, R, p)
+    place_frames(placed(tree, R0, p0), q, R, p)
     tips = {}
     for j in sorted(set(range(tree.n)) - set(tree.parent)):
         riding = [f.position for f in frames if f.parent == tree.link_names[j]]

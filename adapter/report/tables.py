@@ -15,6 +15,7 @@ from adapter.gap.phrases import SHOWN_UNITS
 from adapter.judgement.priors import is_shown
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH
+from adapter.model.tree import Tree
 from adapter.report.learned_panels import SHARE_ALONE, theta_started
 from adapter.report.words import REFUSALS, count, number, with_doubt
 from adapter.runs.run_folder import RunData
@@ -94,7 +95,7 @@ def joint_tables(data: RunData) -> list[Table]:
         columns.append(("Not explained", "N m rms", _column(theta["torque_rmse_nm"])))
     if theta.get("validation_torque_rmse_nm"):
         columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
-    effects = effect_columns(active_effects(data.model.effects, data.n), data.n)
+    effects = effect_columns(active_effects(data.model.effects, data.n), data.model.tree)
     more = [(head, unit, cells) for (head, unit), cells in effects.items()]
     return [by_column(columns), *([by_column([names, *more])] if more else [])]
 
@@ -115,7 +116,7 @@ def _column(values: Sequence[Any], scale: float = 1.0) -> list[str]:
 
 
 def effect_columns(
-    effects: Iterable[Active], n: int, fitted: Collection[tuple[str, str]] | None = None
+    effects: Iterable[Active], tree: Tree, fitted: Collection[tuple[str, str]] | None = None
 ) -> dict[tuple[str, str], list[str]]:
     """Cells (n,) of each (head, unit): value ± standard deviation of effects by joint.
 
@@ -124,6 +125,7 @@ def effect_columns(
     are given.
     """
     columns: dict[tuple[str, str], list[str]] = {}
+    n = tree.n
     for active in effects:
         effect = active.effect
         joints = range(n) if effect.scope == ALL and active.joint < 0 else [active.joint]
@@ -131,13 +133,14 @@ def effect_columns(
             left_out = fitted is not None and (effect.name, key) not in fitted
             if np.ndim(value) or joints[0] < 0 or left_out:
                 continue
-            given = effect.units()[key]
+            slides = active.joint >= 0 and tree.slides[active.joint]
+            given = effect.units(slides)[key]
             factor, unit = SHOWN_UNITS.get(given, (1.0, with_squares(given)))
             head = effect.name.replace("_", " ").capitalize()
             column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * n)
             std = active.std.get(key)
             shown = "not shown"
-            if is_shown(effect.name, key, std):
+            if is_shown(effect.name, key, std, slides):
                 shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown

@@ -223,7 +223,7 @@ def _lacks(data: RunData, fall: Fall) -> list[Finding]:
                 lasting=True,
                 parameters=dict(x.values),
                 std=dict(x.std),
-                units=effect.units(),
+                units=effect.units(data.model.tree.slides[x.joint]),
                 evidence=np.nan,
                 overlaps={},
                 split_by="",
@@ -267,9 +267,11 @@ def truth_tables(data: RunData) -> list[Table]:
         )
     ]
     fitted = {(e["effect"], key) for e in data.model.effects for key in e.get("std") or ()}
-    told = effect_columns(active_effects(data.model.effects, n), n, fitted)
+    told = effect_columns(active_effects(data.model.effects, n), data.model.tree, fitted)
     columns = []
-    for (head, unit), cells in effect_columns(active_effects(entries, n), n, fitted).items():
+    for (head, unit), cells in effect_columns(
+        active_effects(entries, n), data.model.tree, fitted
+    ).items():
         columns += [(head, unit, told.get((head, unit), [DASH] * n)), ("in truth", unit, cells)]
     tables = [by_column([names, *torque]), *([by_column([names, *columns])] if columns else [])]
     loads = [

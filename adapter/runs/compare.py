@@ -218,7 +218,7 @@ def _motion(model: SelfModel, seed: int) -> tuple[Array, Array, Array, Array]:
 
 def _hand(model: SelfModel, q: Array) -> Array:
     """Places (m, 3) of the hand in the base, m."""
-    frames, riding, n = frames_of(model.tree.parent, model.lam), hand_frame(model), model.tree.n
+    frames, riding, n = frames_of(model.tree, model.lam), hand_frame(model), model.tree.n
     R, o, places = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(q), 3))
     for k, row in enumerate(q):
         place_frames(frames, row, R, o)

@@ -313,7 +313,7 @@ def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
                     "joints": [j + 1],
                     "parameters": parameters,
                     "std": {effect.key: float(outcome.effects_std[k, j])},
-                    "units": KNOWN[name].units(),
+                    "units": KNOWN[name].units(tree.slides[j]),
                 }
             )
     return entries

@@ -17,6 +17,8 @@ def present(
 ) -> tuple[SelfModel, list[str]]:
     """The robot with the joints that a recording or an arm lacks (a gripper's) locked at zero.
 
+    Of one that it has, and the robot holds still (a gripper's finger), a sentence speaks.
+
     Args:
         names: joints of the recording or the arm; where it has none of the robot's, nothing is
             locked: it may be the same arm under other names, or another arm.
@@ -25,14 +27,19 @@ def present(
     Returns:
         The robot, and a sentence where joints were locked.
     """
+    still = [frame.joint for frame in documented.frames if frame.joint in names]
+    idle = [
+        f"{source}: has {', '.join(still)}, which {documented.name} holds still (--joints A,B,... "
+        "with them among these learns them)"
+    ] * bool(still)
     absent = [name for name in documented.tree.joint_names if name not in names]
     if not absent or len(absent) == documented.tree.n:
-        return documented, []
+        return documented, idle
     said = (
         f"{source}: has no joint {', '.join(absent)}; locked at zero in {documented.name} "
         "(--lock JOINT=VALUE gives another value)"
     )
-    return locked(documented, dict.fromkeys(absent, 0.0)), [said]
+    return locked(documented, dict.fromkeys(absent, 0.0)), [said, *idle]
 
 
 def counted(documented: SelfModel, source: object, count: int | None) -> tuple[str, ...]:

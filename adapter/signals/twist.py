@@ -63,7 +63,7 @@ class TwistSynthesis:
         self._imus = imus
         self.layout = StateLayout(documented.tree.n, documented.tree.floating)
         # a plain tuple: numba takes 3 µs longer for a named one
-        self._frames = tuple(frames_of(documented.tree.parent, documented.lam))
+        self._frames = tuple(frames_of(documented.tree, documented.lam))
         self._base = np.empty(0) if self.layout.floating else base_at_rest(documented.gravity)
 
     def fill(self, records: Array, raw: Raw) -> None:

@@ -8,64 +8,41 @@ messages.
     /residuals                sensor_msgs/JointState     effort: what the estimate does not explain
     /residual_noise           sensor_msgs/JointState     effort: its standard deviation so far
     /external_torques         sensor_msgs/JointState     effort: what the surroundings push with
-    /external_wrench          geometry_msgs/WrenchStamped  on the last link, axes of the base
-    /lambda, /lambda_std      std_msgs/Float64MultiArray (n, 6): [turn; shift] off the documentation
-    /theta, /theta_std        std_msgs/Float64MultiArray (n, 10)
-    /load                     std_msgs/Float64MultiArray mass and its standard deviation, kg
-    /loop_time                std_msgs/Float64MultiArray p50 and p99 of the last seconds, µs
-    /findings                 std_msgs/String            each finding once, as a sentence
     /state                    std_msgs/String            the headline, where it changes
-    /robot_description        std_msgs/String            URDF of the documented arm
-    /tf                       tf2_msgs/TFMessage         the documented arm, and under learned/ ours
+
+and, as a recording has them, all that `adapter.realtime.run_messages` tells: a layout that
+somebody made for the one serves the other.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import socket
-from itertools import islice
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.robots import to_urdf
 from adapter.errors import MeansError, UsageError
-from adapter.gap.monitor_judge import sentence
-from adapter.model.inertia import PARAMETERS
-from adapter.model.spatial import Array, matrix_from_zxz, quaternion_from_matrix, rot_z
-from adapter.realtime.run_messages import table_fields, wrench_fields, xyz
-from adapter.view.now import KnownRun, Now, untold
+from adapter.model.spatial import Array
+from adapter.realtime import run_messages
+from adapter.realtime.run_messages import RunMessages, ShownArm
+from adapter.view.now import KnownRun, Now
 from adapter.view.server import HOST
-from drivers.files.messages import Fields, encode, header
-from drivers.files.ros_types import (
-    FLOAT64_MULTI_ARRAY,
-    JOINT_STATE,
-    STRING,
-    TF,
-    WRENCH_STAMPED,
-    schemas,
-)
+from drivers.files.estimates import EstimateNames
+from drivers.files.mcap.writer import EXTERNAL_TORQUES
+from drivers.files.messages import Message, encode, header
+from drivers.files.ros_types import JOINT_STATE, STRING, schemas
 
 BACKLOG = 64  # messages that wait for a slow client; then the oldest go
-DESCRIPTION_S = 2.0  # the description comes again and again: nobody is told what was before
-LEARNED = "learned/"  # prefix of the learned arm's frames
+DESCRIPTION_S = 2.0  # what is said once comes again and again: nobody is told what was before
 NONE: Array = np.zeros(0)
 TOPICS = {
-    "/joint_states": JOINT_STATE,
-    "/residuals": JOINT_STATE,
-    "/residual_noise": JOINT_STATE,
-    "/external_torques": JOINT_STATE,
-    "/external_wrench": WRENCH_STAMPED,
-    "/lambda": FLOAT64_MULTI_ARRAY,
-    "/lambda_std": FLOAT64_MULTI_ARRAY,
-    "/theta": FLOAT64_MULTI_ARRAY,
-    "/theta_std": FLOAT64_MULTI_ARRAY,
-    "/load": FLOAT64_MULTI_ARRAY,
-    "/loop_time": FLOAT64_MULTI_ARRAY,
-    "/findings": STRING,
+    **dict.fromkeys(
+        ("/joint_states", "/residuals", "/residual_noise", EXTERNAL_TORQUES), JOINT_STATE
+    ),
     "/state": STRING,
-    "/robot_description": STRING,
-    "/tf": TF,
+    **run_messages.TOPICS,
 }
 
 
@@ -104,7 +81,9 @@ class FoxgloveView:
         need_foxglove()
         import foxglove
 
-        arm = self._arm = known.documented
+        tree = known.documented.tree
+        names = EstimateNames(tree.joint_names, tree.body_names, known.effects)
+        self._names, self._messages = names, RunMessages(names, ShownArm.of(known.documented))
         self._context = context = foxglove.Context()  # channels end with it
         self._channels: dict[str, Any] = {}
         for topic, name in TOPICS.items():
@@ -115,7 +94,7 @@ class FoxgloveView:
             )
         try:
             self._server = foxglove.start_server(
-                name=f"panda-adapter, {arm.name}",
+                name=f"panda-adapter, {known.documented.name}",
                 host=HOST,
                 port=port,
                 context=context,
@@ -124,89 +103,37 @@ class FoxgloveView:
             )
         except (RuntimeError, OSError) as error:
             raise MeansError(f"nothing can be served on port {port}: {error}") from None
-        self._description = {"data": to_urdf(arm)}
-        self._described_s, self._version = -np.inf, 0
-        self._told: set[str] = set()
-        self._headline = ""
+        self._described_s, self._headline = -np.inf, ""
 
     def __call__(self, now: Now) -> None:
         """Take what is to be seen now; waits for nobody."""
-        for topic, fields in self._due(now).items():
-            data = encode(TOPICS[topic], fields)
-            self._channels[topic].log(data, log_time=max(now.stamp_ns, 0))
+        for message in self._due(now):
+            data = encode(message.schema, message.fields)
+            self._channels[message.topic].log(data, log_time=max(message.stamp_ns, 0))
         if now.view.done:
             self._server.stop()
 
-    def _due(self, now: Now) -> dict[str, Fields]:
-        due, stamp_ns = dict[str, Fields](), now.stamp_ns
+    def _due(self, now: Now) -> Iterator[Message]:
+        stamp_ns, view = now.stamp_ns, now.view
+        if view.elapsed_s - self._described_s > DESCRIPTION_S:
+            self._described_s, self._headline = view.elapsed_s, ""
+            yield from self._messages.first(stamp_ns)
         if np.isfinite(now.q).all():
-            due["/joint_states"] = self._joints(stamp_ns, now.tau, now.q, now.dq)
-            due["/tf"] = {"transforms": self._transforms(now)}
+            yield self._joints("/joint_states", stamp_ns, now.tau, now.q, now.dq)
         if np.isfinite(now.residual).all():
-            due["/residuals"] = self._joints(stamp_ns, now.residual)
-            due["/residual_noise"] = self._joints(stamp_ns, now.noise)
-        push = now.view.push
-        if push is not None:
-            due["/external_torques"] = self._joints(push.stamp_ns, push.torque)
-            base, wrench = self._arm.tree.base_name, push.wrench.reshape(2, 3)
-            due["/external_wrench"] = wrench_fields(push.stamp_ns, base, wrench)
-        return due | self._slow(now)
-
-    def _joints(self, stamp_ns: int, tau: Array, q: Array = NONE, dq: Array = NONE) -> Fields:
-        """Torques (n,) N m, where they are told with q and dq (n,) rad and rad/s."""
-        signals = {"position": q, "velocity": dq, "effort": tau}
-        return {"header": header(stamp_ns), "name": self._arm.tree.joint_names, **signals}
-
-    def _slow(self, now: Now) -> dict[str, Fields]:
-        """What is said when there is a new estimate, or news; and words, now and then."""
-        due, snapshot = dict[str, Fields](), now.view.snapshot
-        if snapshot is not None and now.frames is not None and snapshot.version != self._version:
-            self._version = snapshot.version
-            by_joint = "joint", "turn x y z in rad; shift x y z in m"
-            due["/lambda"] = table_fields(by_joint, now.frames.off)
-            due["/lambda_std"] = table_fields(by_joint, now.frames.off_std)
-            by_link = "link", " ".join(PARAMETERS)
-            due["/theta"] = table_fields(by_link, snapshot.theta)
-            due["/theta_std"] = table_fields(by_link, snapshot.theta_std)
-        if now.load is not None:
-            mass = np.array([now.load["m"], now.load["m_std"]])
-            due["/load"] = table_fields(("mass and its standard deviation, kg",), mass)
-        if now.lately is not None:
-            loop = now.lately.of("loop_us")
-            shares = np.array([loop.percentile_us(share) or np.nan for share in (50.0, 99.0)])
-            due["/loop_time"] = table_fields(("p50 and p99 of the last seconds, us",), shares)
-        if now.view.elapsed_s - self._described_s > DESCRIPTION_S:
-            self._described_s = now.view.elapsed_s
-            due["/robot_description"] = self._description
-            self._headline = ""  # once more with it, for those who came meanwhile
+            yield self._joints("/residuals", stamp_ns, now.residual)
+            yield self._joints("/residual_noise", stamp_ns, now.noise)
+        if view.push is not None:
+            yield self._joints(EXTERNAL_TORQUES, view.push.stamp_ns, view.push.torque)
         if now.headline != self._headline:
             self._headline = now.headline
-            due["/state"] = {"data": now.headline}
-        for found in islice(untold(now.findings, self._told), 1):  # the next with the next frame
-            due["/findings"] = {"data": sentence(found, 0.0)}
-        return due
+            yield Message("/state", STRING, stamp_ns, {"data": now.headline})
+        yield from self._messages.seen(view, stamp_ns, now.q)
 
-    def _transforms(self, now: Now) -> list[Fields]:
-        tree, lam = self._arm.tree, self._arm.lam
-        same = np.eye(3)[None], np.zeros((1, 3))
-        found = [([tree.base_name], [LEARNED + tree.base_name], *same)]
-        arms = {"": (matrix_from_zxz(lam[:, :3]), lam[:, 3:])}
-        if now.frames is not None:
-            arms[LEARNED] = now.frames.R, now.frames.p
-        for prefix, (R, p) in arms.items():
-            names = [prefix + name for name in (*tree.link_names, tree.base_name)]  # BASE: the last
-            found.append(([names[i] for i in tree.parent], names[:-1], R @ rot_z(now.q), p))
-        return [
-            {
-                "header": header(now.stamp_ns, parent),
-                "child_frame_id": child,
-                "transform": {
-                    "translation": xyz(place),
-                    "rotation": dict(zip("wxyz", quaternion.tolist(), strict=True)),
-                },
-            }
-            for parents, children, R, p in found
-            for parent, child, quaternion, place in zip(
-                parents, children, quaternion_from_matrix(R), p, strict=True
-            )
-        ]
+    def _joints(
+        self, topic: str, stamp_ns: int, tau: Array, q: Array = NONE, dq: Array = NONE
+    ) -> Message:
+        """Torques (n,) N m, where they are told with q and dq (n,) rad and rad/s."""
+        signals = {"position": q, "velocity": dq, "effort": tau}
+        fields = {"header": header(stamp_ns), "name": self._names.joints, **signals}
+        return Message(topic, JOINT_STATE, stamp_ns, fields)

@@ -14,9 +14,10 @@ import numpy as np
 from adapter.control.feedforward import ModelFeedforward, not_learned
 from adapter.effects.active import with_bodies
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
+from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import base_parameters, frame_observability
+from adapter.realtime.run_messages import nearest_frames
 from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot
 from adapter.realtime.timing import LoopTiming
@@ -233,11 +234,9 @@ class Onlooker:
             return self._frames
         if snapshot.learned >= self._frames_of:
             documented, lam = self.known.documented, snapshot.lam
-            told = matrix_from_zxz(documented.lam[:, :3]), documented.lam[:, 3:]
             seen = frame_observability(documented.tree, lam, documented.gravity)
-            R, p = seen.freedom.nearest(matrix_from_zxz(lam[:, :3]), lam[:, 3:], *told)
-            off = np.hstack([log_rotation(R @ np.swapaxes(told[0], 1, 2)), p - told[1]])
-            self._frames = LearnedFrames(R, p, off, snapshot.lam_std, ~seen.flags)
+            found = nearest_frames(seen.freedom, lam, documented.lam)
+            self._frames = LearnedFrames(*found, snapshot.lam_std, ~seen.flags)
             self._frames_of = snapshot.learned + FRAMES_EVERY
         return self._frames
 

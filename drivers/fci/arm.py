@@ -11,14 +11,20 @@ import numpy as np
 from drivers.fci import tables
 from drivers.fci.codec import JOINTS, State, Status
 from drivers.fci.connect import Connection, open_connection, parse, recover
-from drivers.fci.limits import checked
 from drivers.fci.reader_client import QUICK_SWITCHING
 from drivers.fci.safeguards import Load, RobotSettings
 from drivers.fci.safeguards import parse as parse_safeguards
 from drivers.fci.stream import STALE_NS, TICK_NS, Refusal, StateIntake, StateStream
 from drivers.fci.tables import told
 from drivers.fci.torque_control import TorqueControl
-from drivers.interface import Array, DriverError, Intake, JointSample, NotReady
+from drivers.interface import (
+    Array,
+    DriverError,
+    Intake,
+    JointSample,
+    NotReady,
+    checked_torques,
+)
 
 SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
 RECOVERED_S = 3.0  # from the answer to a recovery until the modes show it
@@ -29,11 +35,6 @@ _NAMES = {
 }
 _LIMP_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP)
 _RECOVERING_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY)
-
-
-def joint_count(address: str) -> int:
-    """Number of joints of the arm behind an address."""
-    return JOINTS
 
 
 class FciArm:
@@ -175,7 +176,7 @@ class FciArm:
         stream, motion = self._need_open()
         if not self.can_move:
             raise DriverError("this robot is only listened to; motion needs --allow-motion")
-        tau = checked(tau)
+        tau = checked_torques(tau, JOINTS)
         state = self._state
         if state is None:
             raise DriverError("no state was read yet; a command answers one")

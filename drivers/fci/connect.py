@@ -145,11 +145,8 @@ def parse(address: str) -> Target:
     protocol = parts.options.get("protocol", AUTO)
     if protocol not in VERSIONS:
         raise DriverError(f"'{address}': no protocol {protocol}; have: {', '.join(VERSIONS)}")
-    recovering = parts.options.get("recover", "0")
-    if recovering not in ("0", "1"):
-        raise DriverError(f"'{address}': recover={recovering}; write recover=1 or recover=0")
-    port = parts.port or tables.PORT
-    return Target(parts.host, port, VERSIONS[protocol], recovering == "1", parts.options)
+    port, recovering = parts.port or tables.PORT, parts.flag("recover")
+    return Target(parts.host, port, VERSIONS[protocol], recovering, parts.options)
 
 
 @dataclass

@@ -5,10 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-import numpy as np
-
 from drivers.fci.codec import JOINTS
-from drivers.interface import Array, DriverError
 
 # N m, the same for Panda/FER and FR3; Franka FCI documentation, robot limits.
 TORQUE_LIMIT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
@@ -95,11 +92,3 @@ class TorqueLimiter:
         if self._strange < STRANGE_TICKS or not all(map(math.isfinite, accepted)):
             return None
         return accepted
-
-
-def checked(tau: Array) -> Array:
-    """(7,) finite torques. Raises DriverError for anything else."""
-    out = np.asarray(tau, dtype=np.float64)
-    if out.shape != (JOINTS,) or not np.isfinite(out).all():
-        raise DriverError(f"a command is {JOINTS} finite torques in N m, got {tau}; nothing sent")
-    return out

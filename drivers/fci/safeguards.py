@@ -35,12 +35,6 @@ class Load(NamedTuple):
     com: Array
     inertia: Array
 
-    @classmethod
-    def ball(cls, mass: float, com: tuple[float, float, float]) -> Load:
-        """A solid ball of hand size."""
-        inertia = 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3)
-        return cls(mass, np.array(com), inertia.ravel())
-
     def payload(self) -> bytes:
         """Of SetLoad."""
         return struct.pack("<13d", self.mass, *self.com, *self.inertia)
@@ -51,7 +45,7 @@ def parse(address: str, options: Mapping[str, str]) -> tuple[float | None, Load 
 
     None leaves the robot's thresholds, or its load, alone. Raises DriverError with the choices.
     """
-    text, collision = options.get("collision", "1"), None
+    text, load = options.get("collision", "1"), options.get("load", "0")
     try:
         collision = None if text == KEEP else float(text)
         if collision is not None and not LEAST <= collision <= MOST:
@@ -61,7 +55,7 @@ def parse(address: str, options: Mapping[str, str]) -> tuple[float | None, Load 
             f"'{address}': collision is a factor from {LEAST:g} to {MOST:g}, or {KEEP}"
         ) from error
     try:
-        return collision, read_load(options.get("load", "0"))
+        return collision, None if load == KEEP else read_load(load)
     except ValueError as error:
         raise DriverError(
             f"'{address}': load is KG or KG,X,Y,Z (m from the flange) up to {HEAVIEST_KG:g} kg, "
@@ -69,15 +63,13 @@ def parse(address: str, options: Mapping[str, str]) -> tuple[float | None, Load 
         ) from error
 
 
-def read_load(text: str) -> Load | None:
-    """Of `?load=KG[,X,Y,Z]|keep`, m from the flange. Raises ValueError."""
-    if text == KEEP:
-        return None
+def read_load(text: str) -> Load:
+    """A solid ball of hand size, of `?load=KG[,X,Y,Z]`, m from the flange. Raises ValueError."""
     mass, *com = (float(part) for part in text.split(","))
     com = com or [0.0, 0.0, 0.0]
     if len(com) != 3 or not 0.0 <= mass <= HEAVIEST_KG or not all(abs(x) <= 1.0 for x in com):
         raise ValueError
-    return Load.ball(mass, (com[0], com[1], com[2]))
+    return Load(mass, np.array(com), 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3).ravel())
 
 
 class RobotSettings:

@@ -35,50 +35,19 @@ LIBFRANKA = {  # by protocol version
     10: "libfranka 0.18 and newer",
 }
 
+_MOVE = (
+    *("success", "motion_started", "preempted", "not_possible", "singular_start"),
+    *("invalid_argument", "reflex", "user_stop", "input_error", "aborted"),
+)
+_STOP = ("success", "not_possible", "user_stop", "reflex", "aborted")
+_RECOVER = ("success", "not_possible", "manual_recovery", "reflex", "user_stop", "aborted")
+# An FR3 knows its safety functions as well.
 MOVE_STATUS = {
-    PANDA: (
-        "success",
-        "motion_started",
-        "preempted",
-        "not_possible",
-        "singular_start",
-        "invalid_argument",
-        "reflex",
-        "user_stop",
-        "input_error",
-        "aborted",
-    ),
-    FR3: (
-        "success",
-        "motion_started",
-        "preempted",
-        "preempted_by_safety",
-        "rejected_by_safety",
-        "not_possible",
-        "singular_start",
-        "invalid_argument",
-        "reflex",
-        "user_stop",
-        "input_error",
-        "aborted",
-    ),
+    PANDA: _MOVE,
+    FR3: (*_MOVE[:3], "preempted_by_safety", "rejected_by_safety", *_MOVE[3:]),
 }
-STOP_STATUS = {
-    PANDA: ("success", "not_possible", "user_stop", "reflex", "aborted"),
-    FR3: ("success", "not_possible", "rejected_by_safety", "user_stop", "reflex", "aborted"),
-}
-RECOVER_STATUS = {
-    PANDA: ("success", "not_possible", "manual_recovery", "reflex", "user_stop", "aborted"),
-    FR3: (
-        "success",
-        "not_possible",
-        "rejected_by_safety",
-        "manual_recovery",
-        "reflex",
-        "user_stop",
-        "aborted",
-    ),
-}
+STOP_STATUS = {PANDA: _STOP, FR3: (*_STOP[:2], "rejected_by_safety", *_STOP[2:])}
+RECOVER_STATUS = {PANDA: _RECOVER, FR3: (*_RECOVER[:2], "rejected_by_safety", *_RECOVER[2:])}
 SET_STATUS = ("success", "not_possible", "invalid_argument", "rejected_by_safety")  # FR3: the last
 
 MEANING = {

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from drivers.files.messages import Fields, header, stamp_of
-from drivers.files.ros_types import LAMBDA_FIELDS, THETA_FIELDS
+from drivers.files.ros_types import LAMBDA_FIELDS, OFFSET_FIELDS, THETA_FIELDS
 from drivers.interface import Array
 
 FLAGS = ("learned", "lambda_source", "lambda_converged", "theta_converged")
-JOINT_TABLES = ("lambda", "lambda_std")
+JOINT_TABLES = ("lambda", "lambda_std", "offset")
 BODY_TABLES = ("theta", "theta_std")
 EFFECT_TABLES = ("effects", "effects_std", "effect_shapes")
 _NUMBERS = (*JOINT_TABLES, *BODY_TABLES, *EFFECT_TABLES, "torque_std")
@@ -33,9 +33,10 @@ def estimate_fields(stamp_ns: int, names: EstimateNames, values: Mapping[str, An
 
     Args:
         stamp_ns: of the newest state learned from, on the arm's clock.
-        values: `FLAGS`; lambda, lambda_std (n, 6); theta, theta_std (b, 10); effects,
-            effects_std, effect_shapes (e, n); torque_std (n,). A table that is missing is not
-            known: not-a-number.
+        values: `FLAGS`; lambda, lambda_std (n, 6); offset (n, 6) [turn; shift] of its frames
+            off the documented ones, rad and m; theta, theta_std (b, 10); effects, effects_std,
+            effect_shapes (e, n); torque_std (n,). A table that is missing is not known:
+            not-a-number.
     """
     n, b, e = len(names.joints), len(names.bodies), len(names.effects)
     shapes: dict[str, tuple[int, ...]] = {
@@ -52,10 +53,19 @@ def estimate_fields(stamp_ns: int, names: EstimateNames, values: Mapping[str, An
         "header": header(stamp_ns),
         **{key: values[key] for key in FLAGS},
         "joints": [
-            {"name": name, **_rows(LAMBDA_FIELDS, value, std), "torque_std": torque_std}
-            for name, value, std, torque_std in joints
+            {
+                "name": name,
+                "value": _row(LAMBDA_FIELDS, value),
+                "std": _row(LAMBDA_FIELDS, std),
+                "off": _row(OFFSET_FIELDS, off),
+                "torque_std": torque_std,
+            }
+            for name, value, std, off, torque_std in joints
         ],
-        "bodies": [{"name": name, **_rows(THETA_FIELDS, *rows)} for name, *rows in bodies],
+        "bodies": [
+            {"name": name, "value": _row(THETA_FIELDS, value), "std": _row(THETA_FIELDS, std)}
+            for name, value, std in bodies
+        ],
         "effects": [
             {"effect": effect, "joint": joint, **{x: tables[y][k, j] for x, y in parts.items()}}
             for k, effect in enumerate(names.effects)
@@ -69,13 +79,15 @@ def estimate_values(fields: Fields) -> dict[str, Any]:
     joints, bodies, effects = fields["joints"], fields["bodies"], fields["effects"]
     n = len(joints)
     found: dict[str, Any] = {"stamp_ns": stamp_of(fields), **{key: fields[key] for key in FLAGS}}
-    for tables, rows, names in (
-        (JOINT_TABLES, joints, LAMBDA_FIELDS),
-        (BODY_TABLES, bodies, THETA_FIELDS),
+    for table, rows, part, names in (
+        ("lambda", joints, "value", LAMBDA_FIELDS),
+        ("lambda_std", joints, "std", LAMBDA_FIELDS),
+        ("offset", joints, "off", OFFSET_FIELDS),  # recordings before it have none
+        ("theta", bodies, "value", THETA_FIELDS),
+        ("theta_std", bodies, "std", THETA_FIELDS),
     ):
-        for table, part in zip(tables, ("value", "std"), strict=True):
-            values = [[row[part][name] for name in names] for row in rows]
-            found[table] = np.array(values, dtype=np.float64).reshape(-1, len(names))
+        values = [[row.get(part, {}).get(name, np.nan) for name in names] for row in rows]
+        found[table] = np.array(values, dtype=np.float64).reshape(-1, len(names))
     for table, part in zip(EFFECT_TABLES, ("value", "std", "shape"), strict=True):
         found[table] = np.array([x[part] for x in effects], dtype=np.float64).reshape(-1, n or 1)
     found["torque_std"] = np.array([row["torque_std"] for row in joints], dtype=np.float64)
@@ -105,7 +117,6 @@ def _table(value: Any, shape: tuple[int, ...]) -> Array:
     return table
 
 
-def _rows(names: Sequence[str], value: Array, std: Array) -> dict[str, dict[str, float]]:
-    """A row of a table and of its standard deviations, by the fields' names."""
-    both = (dict(zip(names, row.tolist(), strict=True)) for row in (value, std))
-    return dict(zip(("value", "std"), both, strict=True))
+def _row(names: Sequence[str], values: Array) -> dict[str, float]:
+    """A row of a table by the fields' names."""
+    return dict(zip(names, values.tolist(), strict=True))

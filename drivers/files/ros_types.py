@@ -29,6 +29,7 @@ LOAD = "panda_adapter_msgs/msg/Load"
 TIMING = "panda_adapter_msgs/msg/Timing"
 
 LAMBDA_FIELDS = ("alpha", "beta", "gamma", "px", "py", "pz")  # eq. 3b
+OFFSET_FIELDS = ("rx", "ry", "rz", "x", "y", "z")  # of a frame off the documented one, rad and m
 THETA_FIELDS = ("m", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # eq. 4b
 SHARE_FIELDS = ("p50", "p99", "p99_9", "max")
 TIMES = ("tick", "loop", "plant", "lateness", "period", "age")
@@ -40,9 +41,10 @@ def _doubles(names: tuple[str, ...]) -> str:
 
 _OWN = {
     "panda_adapter_msgs/Lambda": _doubles(LAMBDA_FIELDS),
+    "panda_adapter_msgs/Offset": _doubles(OFFSET_FIELDS),
     "panda_adapter_msgs/Theta": _doubles(THETA_FIELDS),
     "panda_adapter_msgs/JointEstimate": "string name\npanda_adapter_msgs/Lambda value\n"
-    "panda_adapter_msgs/Lambda std\nfloat64 torque_std\n",
+    "panda_adapter_msgs/Lambda std\npanda_adapter_msgs/Offset off\nfloat64 torque_std\n",
     "panda_adapter_msgs/BodyEstimate": "string name\npanda_adapter_msgs/Theta value\n"
     "panda_adapter_msgs/Theta std\n",
     "panda_adapter_msgs/EffectEstimate": "string effect\nstring joint\nfloat64 value\n"

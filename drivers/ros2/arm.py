@@ -22,7 +22,14 @@ from typing import IO, Any
 
 import numpy as np
 
-from drivers.interface import Array, CommandCount, DriverError, Intake, JointSample
+from drivers.interface import (
+    Array,
+    CommandCount,
+    DriverError,
+    Intake,
+    JointSample,
+    checked_torques,
+)
 from drivers.process import start_module
 from drivers.ros2.bridge import BRAKES, Start
 from drivers.ros2.memory import SLOTS, Asked, Doing, Memory, Refusal
@@ -61,7 +68,8 @@ class Ros2Arm:
     def __init__(
         self, address: str, joint_names: Sequence[str] | None = None, allow_motion: bool = False
     ) -> None:
-        self._settings = where = parse(address)
+        self._address, self._settings = address, parse(address)
+        where = self._settings
         names = tuple(joint_names or where.joints)
         if not names:
             raise DriverError(f"'{address}': which joints? name a robot, or joints=A,B,... here")
@@ -98,7 +106,7 @@ class Ros2Arm:
 
     def _started(self, rescue: bool = False) -> _Process:
         """A new bridge; samples and counts begin with what it hears from now on."""
-        bridge = _Process(self._settings, self.joint_names, (self.can_move, rescue))
+        bridge = _Process(self._address, self.joint_names, (self.can_move, rescue))
         try:
             told = bridge.first_word(READY_S)
             if "ready" not in told:
@@ -142,10 +150,7 @@ class Ros2Arm:
         bridge = self._open()
         if not self.can_move:
             raise DriverError("this arm is only listened to; motion needs --allow-motion")
-        wanted = np.asarray(tau, dtype=np.float64)
-        if wanted.shape != (len(self.joint_names),) or not np.isfinite(wanted).all():
-            n = len(self.joint_names)
-            raise DriverError(f"a command has to be {n} finite torques in N m, got {tau!r}")
+        wanted = checked_torques(tau, len(self.joint_names))
         self._listen(bridge)
         cut = np.clip(wanted, -self._effort, self._effort)
         count = self.intake.commands
@@ -228,7 +233,7 @@ class _Process:
         alive: it runs; costs no system call while it has not closed its output.
     """
 
-    def __init__(self, settings: Any, joints: tuple[str, ...], leave: tuple[bool, bool]) -> None:
+    def __init__(self, address: str, joints: tuple[str, ...], leave: tuple[bool, bool]) -> None:
         self.memory = Memory(len(joints))
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._nudge = os.eventfd(0, os.EFD_CLOEXEC)
@@ -236,7 +241,7 @@ class _Process:
         self._complaints: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = start_module(
             "drivers.ros2.bridge",
-            Start(settings, joints, *leave, *filenos).as_text(),
+            json.dumps(Start(address, joints, *leave, *filenos)),
             filenos,
             stdin=subprocess.PIPE,
             stderr=self._complaints,

@@ -20,8 +20,7 @@ import threading
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from drivers.files.ros_types import FLOAT64_MULTI_ARRAY, JOINT_STATE, STRING
 from drivers.interface import Array, DriverError
 from drivers.ros2.holding import Braker
 from drivers.ros2.memory import Asked, Doing, Memory, Refusal
-from drivers.ros2.settings import Ros2Settings
+from drivers.ros2.settings import parse
 from drivers.ros2.wire import Found, Network, Publication, described
 
 DESCRIPTION = "/robot_description"
@@ -50,37 +49,24 @@ PRIORITY = 75  # SCHED_FIFO; above the loop, which waits for what is delivered h
 BRAKES = (Doing.BRAKING, Doing.HOLDING)
 
 
-@dataclass(frozen=True)
-class Start:
-    """What the bridge is told at its start.
+class Start(NamedTuple):
+    """What the bridge is told at its start, as JSON on its command line.
 
     Attributes:
-        settings: of the address; joints: names in the driver's order.
+        address: of the arm; joints: names in the driver's order.
         allow_motion: whether commands may be sent.
         rescue: brake at once: another bridge died while the arm was driven.
         memory, wake, nudge: descriptors: the shared block, what wakes the driver when a state is
             there, and what wakes the bridge when a command is.
     """
 
-    settings: Ros2Settings
-    joints: tuple[str, ...]
+    address: str
+    joints: Sequence[str]
     allow_motion: bool
     rescue: bool
     memory: int
     wake: int
     nudge: int
-
-    def as_text(self) -> str:
-        """For a command line."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def of(cls, text: str) -> Start:
-        """From it."""
-        told = json.loads(text)
-        where = told["settings"]
-        where |= {key: tuple(where[key]) for key in ("joints", "effort")}
-        return cls(**{**told, "settings": Ros2Settings(**where), "joints": tuple(told["joints"])})
 
 
 def runs_of(data: bytes, layout: Layout | None = None) -> tuple[str, list[Array]]:
@@ -151,7 +137,8 @@ class Bridge:
     """See the module. Raises DriverError where there is no such arm."""
 
     def __init__(self, start: Start) -> None:
-        self._start, where = start, start.settings
+        self._start, self._where = start, parse(start.address)
+        where = self._where
         self._memory = Memory(len(start.joints), start.memory)
         self._network = Network(where.domain, where.local)
         self._states = self._network.subscribe(where.states, JOINT_STATE)
@@ -174,7 +161,7 @@ class Bridge:
         first = self._first_states()
         names = parse_joint_state(first[-1]).names
         missing = [name for name in self._start.joints if name not in names]
-        where = self._start.settings
+        where = self._where
         if missing:
             raise DriverError(
                 f"{where.states} has no joint {', '.join(missing)}; it has: {', '.join(names)}"
@@ -203,7 +190,7 @@ class Bridge:
     def _first_states(self) -> list[bytes]:
         """Enough to tell the rate, once others had time to be discovered. Raises DriverError."""
         found: list[bytes] = []
-        topic, begin = self._start.settings.states, time.monotonic()
+        topic, begin = self._where.states, time.monotonic()
         while len(found) < MEASURED or time.monotonic() < begin + SEEN_S:
             found += self._states.take()
             waited_s = time.monotonic() - begin
@@ -212,7 +199,7 @@ class Bridge:
                 if waited_s > SLOW_S or all(x.topic != topic for x in seen):
                     raise DriverError(
                         f"{len(found)} joint states on {topic} within {waited_s:.0f} s in domain "
-                        f"{self._start.settings.domain}; topics of joint states that are "
+                        f"{self._where.domain}; topics of joint states that are "
                         f"published: {described(seen)}"
                     )
             time.sleep(0.002)
@@ -220,7 +207,7 @@ class Bridge:
 
     def _effort(self) -> Array:
         """(n,) largest torques, from the address or the robot's description."""
-        joints, told = self._start.joints, self._start.settings.effort
+        joints, told = self._start.joints, self._where.effort
         if told:
             if len(told) != len(joints):
                 raise DriverError(f"effort has {len(told)} numbers for {len(joints)} joints")
@@ -239,7 +226,7 @@ class Bridge:
         return np.array([limits.get(name, np.inf) for name in joints])
 
     def _check_command(self, commands: Publication) -> None:
-        topic, where = self._start.settings.command, self._start.settings
+        topic, where = self._where.command, self._where
         if where.hz < LEAST_HZ and not where.gravity:
             raise DriverError(
                 f"at {where.hz:.0f} Hz an arm cannot be held by torques that carry its weight: "
@@ -261,7 +248,7 @@ class Bridge:
             )
 
     def _others(self, commands: Publication) -> list[Found]:
-        topic = self._start.settings.command
+        topic = self._where.command
         return [x for x in self._network.publishers() if x.topic == topic and x.key != commands.key]
 
     def run(self) -> None:
@@ -353,7 +340,7 @@ class Bridge:
         elif doing == Doing.DRIVING:
             unheard_s, silent_s = now - self._heard, now - 1e-9 * memory.words.beat_ns
             if silent_s > SILENCE_S and unheard_s > 0.5 * silent_s:  # a command answers a state
-                topic = self._start.settings.states
+                topic = self._where.states
                 self._take_over(f"{topic} has been silent for {1e3 * unheard_s:.0f} ms")
             elif silent_s > SILENCE_S:
                 self._take_over(f"no command came for {1e3 * silent_s:.0f} ms")
@@ -362,7 +349,7 @@ class Bridge:
         if self._commands is not None and now > self._look_at:
             self._look_at = now + LOOK_S
             if doing == Doing.DRIVING and self._others(self._commands):
-                topic = self._start.settings.command
+                topic = self._where.command
                 self._take_over(f"somebody else began to publish on {topic}")
 
     def _take_over(self, why: str) -> None:
@@ -401,7 +388,7 @@ def say(**what: Any) -> None:
 
 def main() -> None:
     """Run by the driver."""
-    start = Start.of(sys.argv[1])
+    start = Start(*json.loads(sys.argv[1]))
     with contextlib.suppress(OSError):  # the threads of DDS begin later and inherit it
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     try:

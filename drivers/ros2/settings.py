@@ -6,12 +6,13 @@ import os
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from drivers.address import Address
+from drivers.address import Address, number_of
 from drivers.interface import DriverError
 
 OPTIONS = ("command", "domain", "local", "hz", "joints", "effort", "gravity", "timeout_ms")
 EXAMPLE = "ros2:///joint_states?command=/effort_controller/commands"
 HIGHEST_DOMAIN = 232
+SPAN = 1e-3, 1e6  # of hz, N m, ms; whatever lies outside is a slip
 
 
 @dataclass(frozen=True)
@@ -45,45 +46,23 @@ def parse(address: str) -> Ros2Settings:
     parts = urlsplit(address)
     if parts.netloc or len(parts.path) < 2:
         raise DriverError(f"'{address}' names no topic; write {EXAMPLE} (three slashes)")
-    options = Address.of(f"ros2://ros?{parts.query}", OPTIONS).options
-    command = options.get("command", "")
+    place = Address.of(f"ros2://ros?{parts.query}", OPTIONS)
+    options, command = place.options, place.options.get("command", "")
     if command and not command.startswith("/"):
         raise DriverError(f"'{address}': command={command} is no topic; as in {EXAMPLE}")
     domain = options.get("domain", os.environ.get("ROS_DOMAIN_ID") or "0")
     if not domain.isdecimal() or int(domain) > HIGHEST_DOMAIN:
         raise DriverError(f"'{address}': domain {domain} is not a number from 0 to 232")
     joints = tuple(x for x in options.get("joints", "").split(",") if x)
-    effort = tuple(_number(address, "effort", x) for x in options.get("effort", "").split(",") if x)
+    effort = tuple(number_of("effort", x, *SPAN) for x in options.get("effort", "").split(",") if x)
     return Ros2Settings(
         states=parts.path,
         command=command,
         domain=int(domain),
-        local=_flag(address, options, "local"),
-        hz=_number(address, "hz", options.get("hz", "1000")),
+        local=place.flag("local"),
+        hz=place.number("hz", 1000.0, *SPAN),
         joints=joints,
         effort=effort,
-        gravity=_flag(address, options, "gravity"),
-        timeout_s=1e-3 * _number(address, "timeout_ms", options.get("timeout_ms", "200")),
+        gravity=place.flag("gravity"),
+        timeout_s=1e-3 * place.number("timeout_ms", 200.0, *SPAN),
     )
-
-
-def joint_count(address: str) -> int | None:
-    """Number of joints, where the address names them."""
-    return len(parse(address).joints) or None
-
-
-def _flag(address: str, options: dict[str, str], key: str) -> bool:
-    value = options.get(key, "0")
-    if value not in ("0", "1"):
-        raise DriverError(f"'{address}': {key}={value} has to be 0 or 1")
-    return value == "1"
-
-
-def _number(address: str, key: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < 1e6:
-        raise DriverError(f"'{address}': {key}={text} has to be a number above zero")
-    return value

@@ -8,10 +8,13 @@ and for what it tells others of them; the bytes themselves are ours: what is sen
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg
 
 from drivers.files.ros_types import schemas
 from drivers.interface import DriverError
@@ -24,7 +27,6 @@ LOCAL = """<CycloneDDS><Domain Id="any"><General><Interfaces>
 MISSING = "DDS needs a package that is not installed: pip install 'panda-adapter[ros]'"
 MOST_TAKEN, MOST_ENDS = 32, 4096
 ALIVE = 16  # `cyclonedds.core.InstanceState.Alive`
-_ALIASES = {"byte": "uint8", "char": "uint8"}
 
 
 @dataclass(frozen=True)
@@ -196,38 +198,30 @@ def described(found: Sequence[Found]) -> str:
 @cache
 def dds_type(schema: str) -> Any:
     """The library's class for a message; its values go by as bytes."""
-    package, _, name = schema.split("/")
-    texts = schemas()[schema].split("=" * 80 + "\n")
-    fields = {f"{package}/{name}": texts[0]}
-    for text in texts[1:]:
-        head, _, rest = text.partition("\n")
-        fields[head.removeprefix("MSG: ")] = rest
-    made = _struct(f"{package}/{name}", fields)
+    made = _struct(schema, get_types_from_msg(schemas()[schema], schema))
     made.deserialize = classmethod(lambda cls, data, **how: Encoded(data))
     made.serialize = lambda self, **how: self.encoded
     return made
 
 
-def _struct(name: str, fields: dict[str, str]) -> Any:
+def _struct(name: str, known: Mapping[str, Any]) -> Any:
     """A class of the library for one of several messages, with those that it uses."""
     from cyclonedds.idl import make_idl_struct
 
-    package, short = name.split("/")
-    members = {}
-    for line in fields[name].splitlines():
-        kind, field = line.split(maxsplit=1)
-        if "=" not in field:  # a constant is no member
-            members[field] = _member(kind, fields)
+    package, _, short = name.split("/")
+    members = {field: _member(kind, known) for field, kind in known[name][1]}
     return make_idl_struct(f"{short}_", f"{package}.msg.dds_.{short}_", members)
 
 
-def _member(kind: str, fields: dict[str, str]) -> Any:
+def _member(kind: Any, known: Mapping[str, Any]) -> Any:
     from cyclonedds.idl import types
 
-    base, bracket, size = kind.removesuffix("]").partition("[")
-    base = _ALIASES.get(base, base)
-    plain: dict[str, Any] = {"string": str, "bool": bool}
-    one = _struct(base, fields) if base in fields else plain.get(base) or getattr(types, base)
-    if not bracket:
-        return one
-    return types.array[one, int(size)] if size else types.sequence[one]
+    node, inner = kind
+    if node == Nodetype.NAME:
+        return _struct(inner, known)
+    if node == Nodetype.BASE:
+        plain: dict[str, Any] = {"string": str, "bool": bool, "byte": types.uint8}
+        return plain.get(inner[0]) or getattr(types, inner[0])
+    item, size = inner
+    one = _member(item, known)
+    return types.array[one, size] if node == Nodetype.ARRAY else types.sequence[one]

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import heapq
-from collections import Counter
 from collections.abc import Iterable
 
 import can
-import numpy as np
 
 from sim.damiao import motor
 from sim.damiao.bus import INTERFACES, MULTICAST_GROUP, MULTICAST_PORT
 from sim.damiao.codec import BUS_ERROR, error_frame
-from sim.faults import JOINT, SECONDS, SHARE, Fault, Kind, Value, describe, read_fault
+from sim.faults import JOINT, SECONDS, SHARE, Faults, Kind, Network, Value, describe
 from sim.options import add_served, options_of
 from sim.options import check as check_scenario
 
@@ -51,55 +48,14 @@ STATUS = {
     "overcurrent": motor.OVER_CURRENT,
     "overload": motor.OVERLOAD,
 }
-SPIKE_RAD, JUMP_RAD = 0.5, 0.1
+SPIKE_RAD, JUMP_RAD, LATE_NS = 0.5, 0.1, 3_000_000
 HOT_C = 130.0
 FAULT_STREAM = 1 << 33  # keeps the draws of faults apart from those of truth and noise
 
 
-class Faults:
-    """Faults that are due, drawn by seed; counts what struck.
-
-    Attributes:
-        counts: how often each fault struck.
-    """
-
-    def __init__(self, texts: Iterable[str] = (), seed: int = 0) -> None:
-        """Parse faults. Raises ValueError, naming the choices."""
-        self.faults = tuple(read_fault(text, KINDS | OF_HOSTS) for text in texts)
-        self.counts: Counter[str] = Counter()
-        self._rng = np.random.default_rng([seed, FAULT_STREAM])
-        self._by_name: dict[str, list[Fault]] = {}
-        for fault in self.faults:
-            self._by_name.setdefault(fault.name, []).append(fault)
-
-    def __bool__(self) -> bool:
-        return bool(self.faults)
-
-    def strikes(self, name: str, now_s: float) -> bool:
-        """Whether a fault that hits a share of frames hits this one."""
-        for fault in self._by_name.get(name, ()):
-            if now_s >= fault.at_s and self._rng.random() < fault.value:
-                self.counts[name] += 1
-                return True
-        return False
-
-    def hits(self, name: str, number: int, now_s: float) -> bool:
-        """Whether a motor (from 1) has a fault."""
-        for fault in self._by_name.get(name, ()):
-            if fault.value == number and now_s >= fault.at_s:
-                self.counts[name] += 1
-                return True
-        return False
-
-    def within(self, name: str, now_s: float) -> bool:
-        """Whether a fault that lasts VALUE seconds lasts."""
-        return any(
-            fault.at_s <= now_s < fault.at_s + fault.value for fault in self._by_name.get(name, ())
-        )
-
-    def pick(self, below: int) -> int:
-        """A number from 0 to below - 1."""
-        return int(self._rng.integers(below))
+def board_faults(texts: Iterable[str] = (), seed: int = 0) -> Faults:
+    """Faults of the boards, and of a host's controller. Raises ValueError, naming the choices."""
+    return Faults(texts, KINDS | OF_HOSTS, (seed, FAULT_STREAM))
 
 
 class Outbox:
@@ -112,35 +68,16 @@ class Outbox:
 
     def __init__(self, bus: can.BusABC, faults: Faults) -> None:
         self._bus, self._faults = bus, faults
-        self._later: list[tuple[int, int, can.Message]] = []
-        self._behind: list[can.Message] = []
-        self._count = 0
+        self._network = Network(faults, lambda: LATE_NS, self._damaged)
+        self.next_ns = self._network.next_due
         self.sent = self.failed = 0
 
     def put(self, message: can.Message, now_ns: int, now_s: float) -> None:
         """Send a reply, as far as the faults allow."""
-        if not self._faults:
-            self._send(message)
-            return
-        strikes = self._faults.strikes
-        if strikes("error_frames", now_s):
+        if self._faults and self._faults.strikes("error_frames", now_s):
             self.tell(error_frame(BUS_ERROR))
-        if strikes("drop", now_s):
-            return
-        if strikes("corrupt", now_s):
-            self._corrupt(message)
-        if strikes("late", now_s):
-            self._count += 1
-            heapq.heappush(self._later, (now_ns + 3_000_000, self._count, message))
-        elif strikes("reorder", now_s):
-            self._behind.append(message)
-        else:
-            self._send(message)
-            if strikes("repeat", now_s):
-                self._send(message)
-            waiting, self._behind = self._behind, []
-            for held in waiting:
-                self._send(held)
+        for arrives in self._network.passed(message, now_s, now_ns):
+            self._send(arrives)
 
     def tell(self, message: can.Message) -> None:
         """Put something on the bus that is no reply."""
@@ -149,12 +86,8 @@ class Outbox:
 
     def flush(self, now_ns: int) -> None:
         """Send what is due by now."""
-        while self._later and self._later[0][0] <= now_ns:
-            self._send(heapq.heappop(self._later)[2])
-
-    def next_ns(self) -> int | None:
-        """When the next late reply is due."""
-        return self._later[0][0] if self._later else None
+        for message in self._network.due(now_ns):
+            self._send(message)
 
     def _send(self, message: can.Message) -> None:
         try:
@@ -163,13 +96,14 @@ class Outbox:
         except can.CanError:
             self.failed += 1
 
-    def _corrupt(self, message: can.Message) -> None:
+    def _damaged(self, message: can.Message) -> can.Message:
         size, pick = len(message.data), self._faults.pick
         if pick(2):
             message.data[pick(size)] ^= 1 << pick(8)
         else:
             del message.data[pick(size) :]
             message.dlc = len(message.data)
+        return message
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -191,6 +125,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def check(args: argparse.Namespace) -> None:
     """Raises ValueError for an arm or a fault that does not exist, or is no board's."""
     check_scenario(args.scenario, options_of(args.set))
-    for text in args.fault:
-        if read_fault(text, KINDS | OF_HOSTS).name in OF_HOSTS:
-            raise ValueError(f"fault {text!r} strikes a host's own controller, not the boards")
+    for fault in board_faults(args.fault).faults:
+        if fault.name in OF_HOSTS:
+            raise ValueError(f"fault {fault.name} strikes a host's own controller, not the boards")

@@ -36,7 +36,7 @@ from typing import Protocol
 import can
 from can.util import dlc2len, len2dlc
 
-from sim.damiao.faults import Faults
+from sim.faults import Faults
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000  # bit/s, OpenArm's
 HOST_QUEUE = 64  # frames that the host's controller holds; then it refuses

@@ -19,10 +19,11 @@ from sim.damiao import codec, motor
 from sim.damiao.arm import World
 from sim.damiao.bus import address_of, check_alone, open_bus
 from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
-from sim.damiao.faults import HOT_C, JUMP_RAD, SPIKE_RAD, STATUS, Faults, Outbox
+from sim.damiao.faults import HOT_C, JUMP_RAD, SPIKE_RAD, STATUS, Outbox, board_faults
 from sim.damiao.motor import Motor, motor_set
 from sim.effects import ENCODER, TORQUE
 from sim.engine import DriveLaw
+from sim.faults import Faults
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
 from sim.options import Ending, options_of, sum_up
@@ -228,7 +229,7 @@ class Boards:
             raise ValueError(
                 f"joint boards simulate no effects in sensors, this arm has: {', '.join(have)}"
             )
-        self.faults = faults if isinstance(faults, Faults) else Faults(faults, seed)
+        self.faults = faults if isinstance(faults, Faults) else board_faults(faults, seed)
         self._bus, self._now_ns = bus, now_ns
         levels = replace(
             options.noise or levels_of("none"), dropouts=0.0, repeats=0.0, stamp_jitter_s=0.0
@@ -283,7 +284,7 @@ class Boards:
             "frames": dict(self.frames),
             "replies": self._outbox.sent,
             "replies_not_sent": self._outbox.failed,
-            "faults": dict(self.faults.counts),
+            "faults": dict(+self.faults.counts),
             "ticks": world.ticks,
             "slipped_ms": world.slipped_ns / 1e6,
             "limp_ticks": world.limp_ticks,

@@ -68,7 +68,7 @@ def measured(truth: TreeTruth, record: FallRecord, rng: np.random.Generator) -> 
         N m; base_w (m, 3) and link_w (m, n, 3) rad/s; base_a (m, 3) and link_a (m, n, 3) m/s²,
         minus gravity, at the origins of the frames.
     """
-    links = record.links(truth)
+    _, link_w, link_a, _ = record.links(truth)
     # The reading before the first sample too: a step of the simulator ends with q = q' + h dq.
     before = record.q[:1] - record.dq[:1] / RATE_HZ
     gyro, accel = (d * np.sqrt(RATE_HZ / 2) for d in (GYRO_DENSITY, ACCEL_DENSITY))
@@ -84,8 +84,8 @@ def measured(truth: TreeTruth, record: FallRecord, rng: np.random.Generator) -> 
         "tau": noisy(record.tau, TORQUE_SHARE * truth.limits.effort),
         "base_w": noisy(record.base_w, gyro),
         "base_a": noisy(record.base_a, accel),
-        "link_w": noisy(links.w, gyro),
-        "link_a": noisy(links.a, accel),
+        "link_w": noisy(link_w, gyro),
+        "link_a": noisy(link_a, accel),
     }
 
 

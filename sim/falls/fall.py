@@ -151,23 +151,6 @@ def plan(limits: TreeLimits, t: Array, rng: np.random.Generator) -> tuple[Array,
 
 
 @dataclass(frozen=True, eq=False)
-class LinkTables:
-    """Motion of n links over m samples, (m, n, 3) each, every link in its own frame.
-
-    Attributes:
-        v: velocity of the frame's origin, m/s.
-        w: angular velocity, rad/s.
-        a: acceleration of the origin minus gravity (what an accelerometer reads), m/s².
-        dw: angular acceleration, rad/s².
-    """
-
-    v: Array
-    w: Array
-    a: Array
-    dw: Array
-
-
-@dataclass(frozen=True, eq=False)
 class FallRecord:
     """Exact samples of a fall; row k of everything belongs to one instant.
 
@@ -189,12 +172,17 @@ class FallRecord:
     base_a: Array
     base_dw: Array
 
-    def links(self, truth: TreeTruth) -> LinkTables:
-        """Motion of all moving links, as ideal sensors at their frames would read it."""
+    def links(self, truth: TreeTruth) -> Array:
+        """Motion of all moving links, as ideal sensors at their frames would read it.
+
+        (4, m, n, 3), every link in its own frame: the origin's velocity, m/s, the angular velocity,
+        rad/s, the origin's acceleration minus gravity (what an accelerometer reads), m/s², and the
+        angular acceleration, rad/s².
+        """
         frames = Frames(np.array(truth.parent), truth.R, truth.p)
         base = np.stack((self.base_v, self.base_w, self.base_a, self.base_dw), axis=1)
-        tables = _link_motions(frames, base, self.q, self.dq, self.ddq)
-        return LinkTables(*tables.transpose(2, 0, 1, 3))
+        tables: Array = _link_motions(frames, base, self.q, self.dq, self.ddq)
+        return tables.transpose(2, 0, 1, 3)
 
 
 @compiled

@@ -18,8 +18,9 @@ from sim.faults import (
     NOTHING,
     SECONDS,
     VERSION,
-    Fault,
+    Faults,
     Kind,
+    Network,
     describe,
     read_fault,
 )
@@ -48,111 +49,48 @@ KINDS = {
 }
 SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
 JUMP_RAD = 0.05
-OF_DATAGRAMS = ("drop", "late", "repeat", "reorder", "corrupt")
 ROBOT = {5: "panda", 10: "fr3"}  # by protocol
 AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
 
 
-class Spoiler:
-    """The faults of one server, with a random source of its own.
+class Spoiler(Faults):
+    """The faults of one server."""
 
-    Attributes:
-        counts: how often each fault has acted.
-    """
-
-    def __init__(self, faults: Sequence[Fault], seed: int) -> None:
-        self._rng = np.random.default_rng([seed, 1337])
-        self._lasting = [fault for fault in faults if fault.name not in (*AT_A_TIME, "version")]
-        self._waiting = [fault for fault in faults if fault.name in AT_A_TIME]
-        self.counts: dict[str, int] = {fault.name: 0 for fault in faults}
+    def __init__(self, texts: Sequence[str], seed: int) -> None:
+        super().__init__(texts, KINDS, (seed, 1337))
+        self.counts.update(dict.fromkeys((fault.name for fault in self.faults), 0))
         self._frozen: dict[int, float] = {}
-        self._later: list[tuple[int, bytes]] = []
-        self._held: bytes | None = None
+        self.network = Network[bytes](self, lambda: 1 + self.pick(5), self._damaged)
 
-    def due(self, tick: int) -> list[Fault]:
-        """The faults that happen once and whose time has come."""
-        due = [fault for fault in self._waiting if fault.at_s <= tick * TICK_S]
-        for fault in due:
-            self._waiting.remove(fault)
-            self.counts[fault.name] += 1
-        return due
-
-    def spoil_values(self, frame: StateFrame, tick: int) -> None:
+    def spoil_values(self, frame: StateFrame, now_s: float) -> None:
         """Change measured values in a state, as a broken sensor would."""
-        for fault in self._lasting:
-            if fault.at_s > tick * TICK_S:
-                continue
-            if fault.name in ("stuck", "jump"):
-                at, q = int(fault.value) - 1, frame.fields["q"]
-                if not self.counts[fault.name]:
-                    self.counts[fault.name] = 1
-                    self._frozen[at] = float(q[at])
-                for reading in (q, frame.fields["theta"]):
-                    jumped = reading[at] + JUMP_RAD
-                    reading[at] = jumped if fault.name == "jump" else self._frozen[at]
-            elif fault.name in ("nan", "spike") and self._happens(fault):
-                name = ("q", "dq", "tau_J")[self._rng.integers(3)]
-                joint = self._rng.integers(JOINTS)
-                if fault.name == "nan":
-                    frame.fields[name][joint] = np.nan
-                else:
-                    frame.fields[name][joint] += SPIKES[name] * self._rng.choice((-1.0, 1.0))
-
-    def loses_command(self, tick: int) -> bool:
-        """Whether the network loses the command of this tick."""
-        return any(
-            fault.name == "drop_commands" and fault.at_s <= tick * TICK_S and self._happens(fault)
-            for fault in self._lasting
-        )
+        fields, q = frame.fields, frame.fields["q"]
+        for name in ("stuck", "jump"):
+            for fault in self.acting(name, now_s):
+                at, self.counts[name] = int(fault.value) - 1, 1
+                frozen = self._frozen.setdefault(at, float(q[at]))
+                for reading in (q, fields["theta"]):
+                    reading[at] = frozen if name == "stuck" else reading[at] + JUMP_RAD
+        for name in ("nan", "spike"):
+            if self.strikes(name, now_s):
+                key, joint = tuple(SPIKES)[self.pick(len(SPIKES))], self.pick(JOINTS)
+                off = SPIKES[key] * (1.0 if self.pick(2) else -1.0)
+                fields[key][joint] = np.nan if name == "nan" else fields[key][joint] + off
 
     def deliver(self, state: bytearray, tick: int) -> Sequence[bytes | bytearray]:
         """The datagrams that leave in this tick for this state and those held back before."""
-        if not self._lasting:
+        if not self:
             return (state,)
-        out: list[bytes] = [data for when, data in self._later if when <= tick]
-        self._later = [item for item in self._later if item[0] > tick]
-        held, self._held = self._held, None
-        out.extend(self._pass_on(bytes(state), tick))
-        if held is not None:
-            out.append(held)
-        return out
+        passed = self.network.passed(bytes(state), tick * TICK_S, tick)
+        return [*self.network.due(tick), *passed]
 
-    def forget(self) -> None:
-        """The connection is gone, and with it whatever was under way."""
-        self._later, self._held = [], None
-
-    def _pass_on(self, data: bytes, tick: int) -> list[bytes]:
-        """One datagram through the network."""
-        copies = [data]
-        for fault in self._lasting:
-            waits = fault.at_s > tick * TICK_S or fault.name not in OF_DATAGRAMS
-            if waits or not copies or not self._happens(fault):
-                continue
-            if fault.name == "repeat":
-                copies = copies * 2
-            elif fault.name == "corrupt":
-                copies = [self._corrupt(item) for item in copies]
-            elif fault.name == "reorder":
-                self._held, copies = copies[0], []
-            else:
-                if fault.name == "late":
-                    when = tick + int(self._rng.integers(1, 6))
-                    self._later.extend((when, item) for item in copies)
-                copies = []
-        return copies
-
-    def _corrupt(self, data: bytes) -> bytes:
-        if self._rng.random() < 0.5:
-            return data[: self._rng.integers(len(data))]
+    def _damaged(self, data: bytes) -> bytes:
+        if self.pick(2):
+            return data[: self.pick(len(data))]
         changed = bytearray(data)
-        for at in self._rng.integers(len(data), size=self._rng.integers(1, 9)):
-            changed[at] ^= int(self._rng.integers(1, 256))
+        for _ in range(1 + self.pick(8)):
+            changed[self.pick(len(data))] ^= 1 + self.pick(255)
         return bytes(changed)
-
-    def _happens(self, fault: Fault) -> bool:
-        hit = bool(self._rng.random() < fault.value)
-        self.counts[fault.name] += hit
-        return hit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from sim.faults import read_fault
 from sim.fci.clock import Ticks, undisturbed
 from sim.fci.codec import (
     COMMAND_BYTES,
     HOST,
     PORT,
+    TICK_S,
     VERSIONS,
     BadRequest,
     Request,
@@ -29,7 +29,7 @@ from sim.fci.codec import (
     read_command,
     reply,
 )
-from sim.fci.faults import KINDS, Spoiler, chosen
+from sim.fci.faults import AT_A_TIME, Spoiler, chosen
 from sim.fci.gripper import PORT as GRIPPER_PORT
 from sim.fci.gripper import GripperServer
 from sim.fci.model import model_library, robot_urdf
@@ -203,12 +203,12 @@ class FciServer:
     ) -> None:
         if protocol not in VERSIONS:
             raise ValueError(f"no protocol {protocol}; have: 5, 10")
-        asked = [read_fault(text, KINDS) for text in faults]
+        self._spoiler = Spoiler(faults, scenario.seed)
         self.protocol = self._version = protocol
         self.hand: GripperServer | None = None
         self._core, self._patience_s, self._patient = core, patience_s, patience_s > 0.0
-        self._says = next((int(f.value) for f in asked if f.name == "version"), protocol)
-        self._spoiler = Spoiler(asked, scenario.seed)
+        said = (int(fault.value) for fault in self._spoiler.acting("version", 0.0))
+        self._says = next(said, protocol)
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -304,7 +304,7 @@ class FciServer:
             self._answering = robot.motion is not None and (
                 self._answering or robot.motion.begun or self._unused["stale"] > before
             )
-            if command is not None and self._spoiler.loses_command(self._tick):
+            if command is not None and self._spoiler.strikes("drop_commands", self._tick * TICK_S):
                 command = None
         if command is not None or robot.motion is None:
             self._patient = self._patience_s > 0.0
@@ -315,7 +315,7 @@ class FciServer:
             return
         if self._tick >= self._silent_until:
             self._reporter.fill(self._id)
-            self._spoiler.spoil_values(self._reporter.frame, self._tick)
+            self._spoiler.spoil_values(self._reporter.frame, self._tick * TICK_S)
             for data in self._spoiler.deliver(self._reporter.frame.data, self._tick):
                 session.send(data)
                 self._owed = robot.motion is not None and (self._answering or robot.motion.begun)
@@ -325,7 +325,7 @@ class FciServer:
 
     def _strike(self) -> None:
         """Faults that happen once."""
-        for fault in self._spoiler.due(self._tick):
+        for fault in self._spoiler.once(AT_A_TIME, self._tick * TICK_S):
             if fault.name == "reflex":
                 self.robot.trip(fault.word)
             elif fault.name == "user_stop":
@@ -356,7 +356,7 @@ class FciServer:
             return
         session.close()
         self.robot.drop_client()
-        self._spoiler.forget()
+        self._spoiler.network.forget()
 
     def _answer(self, request: Request) -> bytes | None:
         """The reply to a request, None where it comes later."""

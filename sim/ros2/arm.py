@@ -28,7 +28,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from drivers.interface import DriverError
-from sim.faults import Fault, read_fault
+from sim.faults import Faults
 from sim.fci.clock import PRIORITY, Ticks, undisturbed
 from sim.options import Ending, options_of, sum_up
 from sim.ros2.options import KINDS
@@ -102,10 +102,9 @@ class ServedArm:
         faults: that strike.
     """
 
-    def __init__(self, scenario: Scenario, place: Place, faults: Sequence[Fault] = ()) -> None:
-        self._place, self._faults = place, {fault.name: fault for fault in faults}
+    def __init__(self, scenario: Scenario, place: Place, faults: Sequence[str] = ()) -> None:
+        self._place, self._faults = place, Faults(faults, KINDS, (scenario.seed, 5))
         self._plant = scenario.plant(substeps=SUBSTEPS)
-        self._random = np.random.default_rng([scenario.seed, 5])
         with suppress(OSError):  # the threads of DDS inherit it: a machine that is busy delays them
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         self._domain = Domain(place.domain, LOOPBACK)
@@ -171,9 +170,9 @@ class ServedArm:
         if self._strikes("moved"):
             told += OFF_RAD
         if self._strikes("nan"):
-            told[self._random.integers(len(q))] = np.nan
+            told[self._faults.pick(len(q))] = np.nan
         if self._strikes("jump"):
-            told[self._random.integers(len(q))] += OFF_RAD
+            told[self._faults.pick(len(q))] += OFF_RAD
         none = np.zeros(len(FINGERS))
         parts = np.r_[told, [*FINGERS.values()]], np.r_[dq, none], np.r_[tau, none]
         sec, nanosec = divmod(self._start_ns + self._tick * SECOND_NS // 1000, SECOND_NS)
@@ -182,14 +181,8 @@ class ServedArm:
         self._sent["states"] += 1
 
     def _strikes(self, name: str) -> bool:
-        fault = self._faults.get(name)
-        if fault is None:
-            return False
-        if fault.at_s and (not self._driven or self._tick < self._driven + 1000 * fault.at_s):
-            return False
-        struck = not fault.value or self._random.random() < fault.value
-        self._sent[f"fault {name}"] += int(struck)
-        return bool(struck)
+        since_s = (self._tick - self._driven) / 1000 if self._driven else 0.0
+        return self._faults.strikes(name, since_s)
 
     def summary(self) -> dict[str, Any]:
         """What happened so far."""
@@ -198,6 +191,7 @@ class ServedArm:
             "ticks": self._tick,
             "stalled_ms": self._ticks.stalled,
             **self._sent,
+            **{f"fault {name}": count for name, count in self._faults.counts.items()},
             "braked": self._plant.braked,
             "fault": self._plant.fault,
             "q": q.tolist(),
@@ -237,7 +231,7 @@ def run(args: argparse.Namespace) -> int:
     place = Place(
         args.domain, args.states, args.commands, args.every, args.watch, not args.no_description
     )
-    arm = ServedArm(scenario, place, [read_fault(text, KINDS) for text in args.fault])
+    arm = ServedArm(scenario, place, args.fault)
     try:
         with Ending(args.duration) as ending:
             hz = "" if args.every == 1 else f"&hz={1000 // args.every}"

@@ -23,8 +23,8 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.contacts import ReplayObserver, kind_of
 from adapter.runs.pipeline import make_front_end, make_learner
 from drivers.interface import Array, JointSample
-from drivers.pybullet_arm import PyBulletArm
 from sim.effects import Effect
+from sim.plant import SimulatedArm
 from sim.scenarios import Scenario, build
 from tests.helpers.arm_data import panda_model
 from tests.helpers.benchmark import options, told
@@ -71,7 +71,7 @@ def trial(seed: int, newton: float, learn_s: float, seconds: float) -> dict[str,
         learned.step_each(np.array([sample.stamp_ns]), signals)
         documented.step(sample)
 
-    driver = PyBulletArm(arm.plant())
+    driver = SimulatedArm(arm.plant())
     try:
         ended = run_lockstep(
             driver, front_end, Learning(), controller, learn_s + seconds, each=each

@@ -32,7 +32,7 @@ from adapter.learning.theta import Filtered
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.urdf import read_urdf
 from adapter.physics.identifiability import random_motion
-from adapter.physics.kernels import Frames, base_at_rest, frames_of, link_motions
+from adapter.physics.kernels import Frames, base_at_rest, frames_of, link_motions, placed
 from adapter.signals.front_end import FrontEnd
 from tests.helpers.benchmark import Row, options, write
 from tests.helpers.random_trees import cad_tree
@@ -99,7 +99,7 @@ def motion_error(model: SelfModel, frames: Frames) -> float:
     motion = random_motion(model.tree, POSES, 99)
     base = base_at_rest(model.gravity)[None]
     true, found = np.empty((2, *motion.q.shape, 12))
-    link_motions(frames_of(model.tree.parent, model.lam), motion, base, true)
+    link_motions(frames_of(model.tree, model.lam), motion, base, true)
     link_motions(frames, motion, base, found)
     size, off = (
         np.sqrt((x.reshape(*x.shape[:2], 4, 3) ** 2).sum(axis=(0, 3))) for x in (true, found - true)
@@ -122,7 +122,7 @@ def learn(model: SelfModel, seed: int) -> Row:
         if schema.updates % 20:
             continue
         now = 1e-9 * float(state[:1].view(np.int64)[0]) + front_end.delay_s
-        error = motion_error(model, Frames(np.array(model.tree.parent), schema.R0, schema.p))
+        error = motion_error(model, placed(model.tree, schema.R0, schema.p))
         right = error < GOAL
         right_s = (right_s or now) if right else None
         if schema.converged:

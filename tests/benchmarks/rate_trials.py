@@ -36,7 +36,7 @@ from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
 from adapter.signals.validation import EDGE_S, GRID_S, rms_of, smooth, validation_error
 from drivers.files.mcap import Log
 from drivers.interface import Array, JointSample
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.arm_data import panda_model
 from tests.helpers.benchmark import options, told
@@ -76,7 +76,7 @@ def recorded(seed: int, recipe: Recipe) -> tuple[Log, SelfModel]:
     forward = ModelFeedforward.of(robot)
     controller = ExcitationController(MotionLimits.of(robot), motion, feedforward=forward)
     samples: list[JointSample] = []
-    driver = PyBulletArm(arm.plant())
+    driver = SimulatedArm(arm.plant())
     try:
         front_end = make_front_end(robot, PipelineSettings())
         ended = run_lockstep(

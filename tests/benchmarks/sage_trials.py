@@ -4,7 +4,8 @@
 
 FOLDER holds one folder of SAGE for each motion (`shared/data/so101_sage`). Told are rms tracking
 errors by joint, mrad, as commanded and as foretold; a joint counts where the second is below a
-quarter of the first or below 4 mrad.
+quarter of the first or below 4 mrad. Behind: the error of MuJoCo alone, stepping what `adapter
+export` writes of the servos, over that of our simulation.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ import numpy as np
 from adapter.cli import main as adapter
 from adapter.effects.robots import read_robot
 from adapter.gap.servo import explain
+from adapter.gap.servo_files import servo_mjcf
 from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_signals import Track
 from adapter.gap.servo_words import headline
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import read_position_log
+from tests.helpers.position_mujoco import error_in_mujoco
 
 SHARE, CLOSE_MRAD = 0.25, 4.0
 
@@ -47,7 +50,7 @@ def main() -> None:
         begun = time.process_time()
         gap = explain([logs[name] for name in args.fit.split(",")], model)
         print(f"{headline(gap)}\n{time.process_time() - begun:.0f} s of processor time")
-        arm, close = RigidArm.of(model), []
+        arm, close, written = RigidArm.of(model), [], servo_mjcf(model, gap.servos).text
         for name, own in logs.items():
             track = Track.of(own)
             before, after = (
@@ -56,7 +59,8 @@ def main() -> None:
             )
             if name not in args.fit.split(","):
                 close += ((after < SHARE * before) | (after < CLOSE_MRAD)).tolist()
-            print(f"{name:<20} {before.round(1)} -> {after.round(1)}")
+            there = 1e3 * error_in_mujoco(written, own, track.start) / after
+            print(f"{name:<20} {before.round(1)} -> {after.round(1)}; {there.round(2)}")
         print(f"{sum(close)} of {len(close)} joints of motions not fitted: {np.mean(close):.0%}")
 
 

@@ -12,13 +12,14 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from adapter.experiments.atlas import noisy, online_trial, without_velocity
+from adapter.experiments.atlas import noisy, online_trial
 from adapter.experiments.falls import Falls
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.tree_data import TreeData
@@ -33,7 +34,12 @@ def motions(robot: str, folder: Path, count: int) -> tuple[Any, list[TreeData]]:
     """The truth, and `count` exact motions of it with no velocity measured."""
     data = data_set(floating_panda() if robot == "panda" else atlas(), count, folder=folder)
     source = Falls(data, data)
-    return source.truth, [without_velocity(source.exact(k)) for k in range(count)]
+    found = []
+    for exact in map(source.exact, range(count)):
+        assert exact.links is not None
+        links = replace(exact.links, v=None)
+        found.append(replace(exact, base=replace(exact.base, v=None), links=links))
+    return source.truth, found
 
 
 def floating_panda() -> TreeTruth:

@@ -18,7 +18,7 @@ from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 
 PANDA = documented("panda")
@@ -255,7 +255,7 @@ def test_a_clock_that_is_set_is_no_hole(seconds):
     assert np.abs(speeds - calm).max() < 0.1
 
 
-class Lying(PyBulletArm):
+class Lying(SimulatedArm):
     """A simulated arm whose readings are what the faults make of them."""
 
     def __init__(self, faults: list[Fault]) -> None:

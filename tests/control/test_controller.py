@@ -15,7 +15,7 @@ from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 
 PANDA = documented("panda")
@@ -38,7 +38,7 @@ class Weightless:
     delay_ns = MS
 
     def __init__(self) -> None:
-        self.arm = PyBulletArm(build("nominal", noise="none").plant())
+        self.arm = SimulatedArm(build("nominal", noise="none").plant())
         self.joint_names, self.link_names = self.arm.joint_names, self.arm.link_names
         self.period_ns, self.intake = self.arm.period_ns, self.arm.intake
         self._model = ModelFeedforward.of(PANDA)

@@ -23,7 +23,7 @@ from adapter.effects.robots import to_urdf
 from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.live_tools import played
 from tests.helpers.robot_models import pin_model
@@ -155,7 +155,7 @@ def test_settings_and_starts_that_cannot_be_are_refused():
     ("scenario", "with_model"), [("nominal", True), ("friction", False), ("bent_link", True)]
 )
 def test_the_simulated_arm_follows(scenario, with_model):
-    arm = PyBulletArm(build(scenario, seed=2).plant())
+    arm = SimulatedArm(build(scenario, seed=2).plant())
     arm.connect()
     feedforward = ModelFeedforward.of(PANDA) if with_model else None
     controller = ExcitationController(LIMITS, ExcitationSettings(seed=2), feedforward=feedforward)

@@ -7,9 +7,8 @@ import pytest
 
 from drivers.damiao import codec
 from drivers.damiao.arm import TORQUE_FRAMES
-from drivers.damiao.bus_time import budget, frame_times
 from drivers.damiao.codec import Scales, WireError
-from drivers.damiao.settings import BusSettings
+from drivers.damiao.settings import BusSettings, budget, frame_times
 from drivers.damiao.tables import FAULTS, MOTOR_TYPES, OPENARM, fault_of, type_of
 from drivers.interface import DriverError
 from sim.damiao.codec import data_frame

@@ -17,26 +17,10 @@ from drivers.damiao.tables import troubles_of
 from drivers.damiao.timing import ArrivalClock
 from drivers.interface import DriverError
 from tests.helpers.damiao_tools import LIMITS, Bank, MotorBus, reply_bytes, tick
+from tests.helpers.mutations import mutated
 
 MANY = 10_000
 SCALES = Scales(*LIMITS[0])
-
-
-def mutated(rng, data):
-    """Some bytes changed, cut, doubled or put in."""
-    data = bytearray(data)
-    for _ in range(rng.integers(1, 4)):
-        at = int(rng.integers(len(data) + 1))
-        kind = rng.integers(4)
-        if kind == 0 and data:
-            data[at % len(data)] = int(rng.integers(256))
-        elif kind == 1:
-            del data[at:]
-        elif kind == 2:
-            data[at:at] = rng.bytes(int(rng.integers(1, 5)))
-        else:
-            data[at:] = data[at:] * 2
-    return bytes(data)
 
 
 def need_sound(said):

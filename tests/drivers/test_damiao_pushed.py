@@ -23,34 +23,25 @@ from drivers.damiao.codec import Scales
 from drivers.damiao.guardian import Guardian, GuardianMemory, GuardianMode
 from drivers.damiao.holding import Braker, Push, PushWatch
 from drivers.damiao.settings import BusSettings
-from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario, build
-from tests.helpers.lockstep_drivers import Lockstep
+from tests.helpers.lockstep_drivers import Lockstep, in_place_of_time, on_line
 
 PANDA = documented("panda")
 LIMITS = [Scales(12.5, 25.0, 100.0)] * 2
 
 
 @pytest.fixture
-def on_a_line(monkeypatch):
+def on_a_line():
     """Makes an arm on a line in lockstep, with its boards; sleeping lets the line's time pass."""
     with ExitStack() as stack:
 
         def made(scenario: Scenario) -> tuple[DamiaoArm, Lockstep, Boards]:
-            line = Line()
-            boards = Boards(line.boards, scenario, now_ns=line.now_ns)
+            driver, boards = on_line(scenario)
             stack.callback(boards.close)
-            line.attach(boards)
-            monkeypatch.setattr(
-                holding.time, "sleep", lambda s: line.advance_to(line.now_ns() + int(1e9 * s))
-            )
-            clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-            names = scenario.truth.joint_names
-            arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
-            driver = Lockstep(arm, line)
+            stack.enter_context(in_place_of_time(holding, driver))
             stack.callback(driver.close)
-            return arm, driver, boards
+            return driver.driver, driver, boards
 
         yield made
 

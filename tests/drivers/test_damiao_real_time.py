@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager, suppress
-from pathlib import Path
 
 import can
 import numpy as np
@@ -17,7 +16,8 @@ import pytest
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.bus import wire_of
 from tests.helpers.damiao_tools import Bank, Served
-from tests.helpers.patience import connect
+from tests.helpers.live_tools import wait_for
+from tests.helpers.patience import connect, gone
 
 pytestmark = pytest.mark.alone
 
@@ -110,28 +110,13 @@ while True:
 """
 
 
-def wait_for(condition, what, timeout_s=30.0):
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, what
-        time.sleep(0.005)
-
-
 def ended(pid):
     """Wait for the end of a process; make sure of it."""
     try:
-        wait_for(lambda: gone(pid), "the guardian ends")
+        assert wait_for(lambda: gone(pid)), "the guardian ends"
     finally:
         if not gone(pid):
             os.kill(pid, signal.SIGKILL)
-
-
-def gone(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
 DISOBEYS = f"""{BEGIN}
@@ -174,8 +159,8 @@ def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(serve
 
     bank._take = note
     with driving(DISOBEYS, address) as (loop, _):
-        wait_for(lambda: pushed_s, "the loop pushes")
-        wait_for(lambda: abs(bank.command[1][4]) < 5.0, "the guardian brakes the arm")
+        assert wait_for(lambda: pushed_s), "the loop pushes"
+        assert wait_for(lambda: abs(bank.command[1][4]) < 5.0), "the guardian brakes the arm"
         assert loop.wait(10.0) == -signal.SIGKILL
         time.sleep(0.6)
         assert abs(bank.command[1][4]) < 5.0 and bank.status == [1] * N and not bank.limp
@@ -192,12 +177,12 @@ def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(serve
 def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
     address, bank = served
     with driving(LOOP, address, how) as (loop, guardian):
-        wait_for(lambda: bank.dq.min() > 0.3, "the loop drives the arm")
+        assert wait_for(lambda: bank.dq.min() > 0.3), "the loop drives the arm"
         q0 = bank.q.copy()
         if how == "kill":
             loop.send_signal(signal.SIGKILL)
             loop.wait()
-        wait_for(lambda: np.abs(bank.dq).max() < 0.02, "the guardian brakes the arm")
+        assert wait_for(lambda: np.abs(bank.dq).max() < 0.02), "the guardian brakes the arm"
         time.sleep(0.5)
         assert (np.abs(bank.q - q0) < 0.5).all()
         q1 = bank.q.copy()
@@ -206,7 +191,7 @@ def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
         assert not bank.limp
         assert bank.status == [1] * N
         os.kill(guardian, signal.SIGTERM)  # the operator has put something under the arm
-        wait_for(lambda: bank.status == [0] * N, "the motors are switched off")
+        assert wait_for(lambda: bank.status == [0] * N), "the motors are switched off"
     assert "braked and held" in capfd.readouterr().err
 
 
@@ -234,13 +219,13 @@ def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
     connect(arm)
     second = arm.guardian_pid
     assert second != first
-    wait_for(lambda: gone(first), "the first guardian goes")
+    assert wait_for(lambda: gone(first)), "the first guardian goes"
     time.sleep(0.5)
     assert np.abs(bank.q - q0).max() < 0.05
     assert not bank.limp
     arm.close()
     os.kill(second, signal.SIGTERM)
-    wait_for(lambda: gone(second), "the second guardian ends")
+    assert wait_for(lambda: gone(second)), "the second guardian ends"
 
 
 @needs_multicast
@@ -252,7 +237,9 @@ def test_own_frames_do_not_come_back():
         for can_id in (1, 7, 8, 0x11, 0x7F, 0x80, 0x7FF):
             bus.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(8)))
         seen = []
-        wait_for(lambda: seen.extend(wire.waiting()) or 0x7FF in [f[0] for f in seen], "the last")
+        assert wait_for(lambda: seen.extend(wire.waiting()) or 0x7FF in [f[0] for f in seen]), (
+            "the last"
+        )
         wire.close()
     if sys.platform == "linux":
         assert [frame[0] for frame in seen] == [8, 0x11, 0x7F, 0x80, 0x7FF]
@@ -272,7 +259,9 @@ def test_garbage_between_processes_is_counted(served):
             if k % 10 == 0:
                 arm.read()
                 arm.command(np.full(N, 2.0))
-    wait_for(lambda: (arm.read(), arm.intake.refused["unreadable"] == 100)[1], "all were seen")
+    assert wait_for(lambda: (arm.read(), arm.intake.refused["unreadable"] == 100)[1]), (
+        "all were seen"
+    )
     arm.close()
     intake = arm.intake
     assert intake.received == intake.used + sum(intake.refused.values())

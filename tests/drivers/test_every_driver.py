@@ -15,7 +15,7 @@ import pytest
 
 pytest.register_assert_rewrite("tests.helpers.contract_suite")
 
-from drivers.example_arm import ExampleArm  # noqa: E402
+from docs.examples.udp.example_arm import ExampleArm  # noqa: E402
 from drivers.faults.driver import with_faults  # noqa: E402
 from drivers.files.log import LogArm  # noqa: E402
 from tests.helpers.contract_suite import CHECKS, Make, Rig, Start, Tapped  # noqa: E402

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.faults.alter import corrupt, corrupt_stamp
-from drivers.faults.driver import FaultyDriver, with_faults
+from drivers.faults.driver import FaultyDriver, corrupt, corrupt_stamp, with_faults
 from drivers.faults.spec import KINDS, Fault, Faults
 from drivers.files.log import LogArm
 from drivers.interface import DriverError, EndOfStream, JointSample
+from tests.helpers import contract_suite
 from tests.helpers.live_tools import simulated_arm
 from tests.helpers.mcap_tools import STEP_NS, record, samples
 
@@ -44,10 +44,7 @@ def stamps(found: list[JointSample]) -> np.ndarray:
 
 
 def same(a: JointSample, b: JointSample) -> bool:
-    pairs = [(a.q, b.q), (a.dq, b.dq), (a.tau, b.tau)]
-    if a.links is not None and b.links is not None:
-        pairs += [(a.links.twist, b.links.twist), (a.links.accel, b.links.accel)]
-    return a.stamp_ns == b.stamp_ns and all(x.tobytes() == y.tobytes() for x, y in pairs)
+    return a.stamp_ns == b.stamp_ns and contract_suite.same(a, b)
 
 
 def clean(path) -> list[JointSample]:

@@ -19,6 +19,7 @@ from drivers.fci.limits import TORQUE_STEP
 from drivers.interface import Driver, DriverError, NotReady
 from tests.helpers import fci_peer
 from tests.helpers.fci_peer import Peer
+from tests.helpers.patience import gone
 
 PROTOCOLS = pytest.mark.parametrize("protocol", [5, 10])
 TAU = np.array([3.0, -3.0, 2.0, 1.0, 0.5, -0.5, 0.1])
@@ -422,15 +423,7 @@ def test_the_reader_goes_when_its_driver_is_killed(peer5):
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
     driver.stdout.close()
-    patiently(lambda: not any(map(_alive, pids)))
-
-
-def _alive(pid):
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
+    patiently(lambda: all(map(gone, pids)))
 
 
 @PROTOCOLS

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from drivers.fci import codec, tables
 from drivers.fci.codec import StateDecoder, WireError
 from tests.helpers import fci_peer
+from tests.helpers.mutations import mutated
 
 RANDOM, MUTATED = 6000, 6000
 DECODERS = {protocol: StateDecoder(protocol) for protocol in (5, 10)}
@@ -52,24 +53,6 @@ def replies_or_error(stream, cuts):
         assert len(str(error)) > 20
         return 0
     return 1
-
-
-def mutated(rng, frame):
-    """A copy with a few bytes changed, or bits flipped, or a piece cut, doubled or added."""
-    data = bytearray(frame)
-    kind = rng.integers(4)
-    if kind == 0:
-        for at in rng.integers(len(data), size=rng.integers(1, 9)):
-            data[at] = rng.integers(256)
-    elif kind == 1:
-        data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-    elif kind == 2:
-        begin, end = sorted(rng.integers(len(data) + 1, size=2))
-        data[begin:end] = b""
-    else:
-        begin, end = sorted(rng.integers(len(data) + 1, size=2))
-        data[begin:begin] = data[begin:end]
-    return bytes(data)
 
 
 @pytest.mark.parametrize("protocol", [5, 10])

@@ -14,9 +14,8 @@ from drivers.fci.limits import (
     TORQUE_LIMIT,
     TORQUE_STEP,
     TorqueLimiter,
-    checked,
 )
-from drivers.interface import DriverError
+from drivers.interface import DriverError, checked_torques
 
 ALLOWED = 1.0  # N m per ms, documented: 1000 N m/s
 
@@ -134,7 +133,7 @@ def test_a_new_motion_counts_from_what_the_robot_then_drives_with():
 
 
 def test_commands_are_seven_finite_numbers():
-    assert checked([1, 2, 3, 4, 5, 6, 7]).tolist() == [1, 2, 3, 4, 5, 6, 7]
+    assert checked_torques([1, 2, 3, 4, 5, 6, 7], 7).tolist() == [1, 2, 3, 4, 5, 6, 7]
     for bad in (np.full(7, np.nan), np.zeros(6), np.zeros((1, 7)), [math.inf] + [0.0] * 6):
         with pytest.raises(DriverError, match="7 finite torques"):
-            checked(bad)
+            checked_torques(bad, 7)

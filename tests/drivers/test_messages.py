@@ -23,8 +23,12 @@ NAMES = EstimateNames(("shoulder", "elbow", "wrist"), ("upper", "lower"), ("coul
 
 def an_estimate(seed: int = 0) -> dict:
     rng = np.random.default_rng(seed)
-    shapes = {"lambda": (3, 6), "lambda_std": (3, 6), "theta": (2, 10), "theta_std": (2, 10)}
-    shapes |= {"effects": (1, 3), "effects_std": (1, 3), "effect_shapes": (1, 3)}
+    shapes = {"lambda": (3, 6), "lambda_std": (3, 6), "offset": (3, 6), "theta": (2, 10)}
+    shapes |= {"theta_std": (2, 10)} | {
+        "effects": (1, 3),
+        "effects_std": (1, 3),
+        "effect_shapes": (1, 3),
+    }
     values = {key: rng.normal(size=shape) for key, shape in (shapes | {"torque_std": (3,)}).items()}
     values["lambda_std"][1, 2] = np.nan
     flags = {"learned": 2**40, "lambda_source": "gemessen ✓"}

@@ -59,7 +59,7 @@ def test_types_are_made_from_the_definitions():
         ("ros2:///a?speed=2", "no option 'speed'; have: command, domain"),
         ("ros2:///a?command=b", "command=b is no topic"),
         ("ros2:///a?domain=300", "from 0 to 232"),
-        ("ros2:///a?hz=0", "above zero"),
+        ("ros2:///a?hz=0", "hz is a number from 0.001 to 1000000.0, not .0."),
         ("ros2:///a?local=yes", "0 or 1"),
         ("ros2:///a", "which joints"),
         ("ros2:///a?joints=x,y", "motion needs command="),

@@ -17,6 +17,7 @@ from adapter.gap.servo_kernels import Ground, Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
 from adapter.gap.servo_signals import columns
 from adapter.gap.servo_words import headline
+from adapter.model.spatial import Array
 from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import Log, read_position_log, write_log
 from tests.helpers.position_arm import (
@@ -51,6 +52,30 @@ def test_each_is_named_and_an_unseen_motion_foretold(seed: int, drawn: Drawn) ->
     assert np.median(gap.after) < 1.2 * drawn.noise_rad
     together = next(f for f in gap.findings if f.effect == "servo_velocity_gain").open
     assert bool(together) != drawn.feeds_speed
+
+
+@pytest.mark.parametrize(
+    ("effect", "key", "joints", "size"),
+    [
+        ("servo_dead_band", "dead", (4,), 5e-3),  # rad
+        ("servo_torque_limit", "limit", (5,), 1.8),  # N m
+        # rad; gravity holds it on one side
+        pytest.param("backlash", "backlash", (4,), 8e-3, marks=pytest.mark.slow),
+    ],
+)
+def test_what_limits_a_servo_is_named(effect, key, joints, size) -> None:
+    """And nothing else, with its size; and then it foretells another motion to the noise."""
+    arm = position_arm(2, Drawn(period_s=4e-3))
+    values = np.array(getattr(arm.servos, key))
+    values[np.array(joints) - 1] = size
+    arm = replace(arm, servos=replace(arm.servos, **{key: values}))
+    seen, unseen = as_log(arm.moved("sines", 2)), as_log(arm.moved("points", 52))
+    gap = explain([seen], PANDA, None, [unseen])
+    told = {name for name in named(gap) if name[0] == effect}
+    assert told == {(effect, j) for j in joints}
+    assert named(gap) <= arm.expected
+    assert np.abs(errors(gap, arm)[effect]).max() < 0.05
+    assert (gap.after < 1e-3).all() and (gap.after < 0.2 * gap.before).all()
 
 
 @pytest.mark.parametrize("feeds_speed", [True, False])
@@ -102,15 +127,25 @@ def test_an_arm_that_is_where_its_commands_are_has_nothing_named() -> None:
     assert gap.servos.is_ideal
 
 
+def servo(*numbers: float) -> Array:
+    """(10,) of which the first are told."""
+    return np.pad(np.array(numbers), (0, 10 - len(numbers)))
+
+
+def steers(commands: Array) -> Array:
+    """(2, m) commands whose speed is not fed forward."""
+    return np.array([commands, np.zeros_like(commands)])
+
+
 def test_one_joint_steps_as_a_linear_servo_does() -> None:
     """Without friction it is an oscillator of the second order, whose step is known."""
-    step, x = 1e-4, np.array([2e-3, 0.0, 0.02, 1e-4, 0.0])
+    step, x = 1e-4, servo(2e-3, 0.0, 0.02, 1e-4)
     m = 10000
-    load = Load(np.full(m, 0.15), *np.zeros((3, m)))
+    load = Load(np.full(m, 0.15), *np.zeros((4, m)))
     inertia = x[0] * 0.15 + x[3]
     omega, q = inertia**-0.5, np.empty(m)
     zeta = 0.5 * x[2] * omega
-    follow_alone(x, np.ones(m), load, np.zeros(2), step, q)
+    follow_alone(x, steers(np.ones(m)), load, np.zeros(2), step, q)
     t, fast = step * np.arange(1, m + 1), omega * np.sqrt(1.0 - zeta**2)
     swing = np.cos(fast * t) + zeta * omega / fast * np.sin(fast * t)
     assert np.abs(q - (1.0 - np.exp(-zeta * omega * t) * swing)).max() < 1e-4
@@ -128,11 +163,11 @@ def test_a_table_is_read_between_its_rows() -> None:
 
 def test_friction_holds_a_joint() -> None:
     """A step smaller than what friction holds moves nothing; a larger one stops short of it."""
-    x, m, q = np.array([0.0, 0.0, 0.05, 1e-4, 0.01]), 5000, np.empty(5000)
-    load = Load(*np.zeros((4, m)))
-    follow_alone(x, np.full(m, 0.009), load, np.zeros(2), 1e-3, q)
+    x, m, q = servo(0.0, 0.0, 0.05, 1e-4, 0.01), 5000, np.empty(5000)
+    load = Load(*np.zeros((5, m)))
+    follow_alone(x, steers(np.full(m, 0.009)), load, np.zeros(2), 1e-3, q)
     assert not q.any()
-    follow_alone(x, np.full(m, 0.05), load, np.zeros(2), 1e-3, q)
+    follow_alone(x, steers(np.full(m, 0.05)), load, np.zeros(2), 1e-3, q)
     assert 0.04 - 1e-4 <= q[-1] <= 0.06
     assert np.ptp(q[-100:]) == 0.0
 
@@ -141,11 +176,12 @@ def test_a_stop_within_a_step_makes_no_jump() -> None:
     """A joint that rings and sticks ends hardly elsewhere under 0.1 microrad more of friction."""
     step, m = 1e-3, 3000
     t = step * np.arange(1, m + 1)
-    load, goal = Load(np.full(m, 0.15), *np.zeros((3, m))), 0.1 * np.sign(np.sin(2.0 * np.pi * t))
+    load = Load(np.full(m, 0.15), *np.zeros((4, m)))
+    goal = steers(0.1 * np.sign(np.sin(2.0 * np.pi * t)))
     moved = []
     for rubs in 4e-3 + 1e-7 * np.arange(300):
         q = np.empty(m)
-        follow_alone(np.array([2e-3, 0.0, 5e-3, 1e-4, rubs]), goal, load, np.zeros(2), step, q)
+        follow_alone(servo(2e-3, 0.0, 5e-3, 1e-4, rubs), goal, load, np.zeros(2), step, q)
         moved.append(q)
     assert (np.diff(moved[0])[m // 2 :] == 0.0).any()
     assert np.abs(np.diff(moved, axis=0)).max() < 2e-6
@@ -167,11 +203,21 @@ def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -
     asked = [*words, "--hold-out", str(unseen), "--out", str(tmp_path / "one")]
     assert main(asked) == 0
     said = capsys.readouterr().out
-    for part in ("position gain", "velocity gain", "ms late", "Coulomb", "viscous", "inertia"):
+    for part in (
+        "position gain",
+        "velocity gain",
+        "ms late",
+        "Coulomb",
+        "viscous",
+        "inertia",
+        "at the hand",
+    ):
         assert part in said
     figures = json.loads((tmp_path / "one" / "gap.json").read_text())
     assert max(figures["after"]["tracking_rmse_rad"]) < 1e-4
     assert {f["effect"] for f in figures["findings"]} == {e for e, _ in arm.expected}
+    assert (tmp_path / "one" / "report.html").read_text().count("<svg") == 8
+    assert figures["after"]["hand_rmse_m"] < 1e-4 < figures["before"]["hand_rmse_m"]
     servos = str(tmp_path / "one" / "servo.toml")
     assert figures["servos_out"] == servos
     again = ["gap", str(unseen), "--robot", "panda", "--quiet", "--servo", servos]
@@ -235,10 +281,12 @@ def test_a_servo_file_is_checked(tmp_path: Path, text: str, said: str) -> None:
 def test_a_servo_file_comes_back(tmp_path: Path) -> None:
     servos = position_arm(25).documentation
     ground = Ground(6, np.array([0.0, 0.01, 0.1]), np.array([0.0, 0.0, 1.0]), -0.02, 20.0)
-    servos = replace(servos, ground=ground)
+    limits = {"torque_limit": 9.5, "dead_band": 2e-3, "backlash": 4e-3}
+    servos = replace(servos, ground=ground, **{key: np.array(x) for key, x in limits.items()})
     servos.save(tmp_path / "servo.toml")
     back = read_servos(tmp_path / "servo.toml", servos.joint_names)
-    for key in ("position_gain", "velocity_gain", "coulomb", "viscous", "armature", "feeds_speed"):
+    keys = ("position_gain", "velocity_gain", "coulomb", "viscous", "armature", "feeds_speed")
+    for key in (*keys, *limits):
         assert np.allclose(getattr(back, key), getattr(servos, key), rtol=1e-5), key
     assert back.delay_s == servos.delay_s
     assert back.ground.link == ground.link

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import can
 
-from sim.damiao.faults import Faults
+from sim.damiao.faults import board_faults
 from sim.damiao.line import Line
 from sim.damiao.server import BoardOptions, Boards
 from sim.scenarios import build
@@ -87,7 +87,7 @@ class Rig:
 
     def __init__(self, scenario="nominal", faults=(), seed=0, fd=True, **more) -> None:
         self.scenario = build(scenario, seed) if isinstance(scenario, str) else scenario
-        self.faults = Faults(faults, seed)
+        self.faults = board_faults(faults, seed)
         self.line = Line(fd=fd, faults=self.faults)
         self.fd, self.scale = fd, more.pop("scale", PANDA)
         self.boards = Boards(

@@ -17,7 +17,7 @@ from adapter.realtime.shared import SharedBlock
 from adapter.realtime.supervisor import SharedMemoryOptions
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import DriverError, Intake, JointSample
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.live_learners import (  # noqa: F401  # these are the tests' as well
     Diary,
@@ -38,8 +38,8 @@ from tests.helpers.live_learners import (  # noqa: F401  # these are the tests' 
 PANDA = documented("panda")
 
 
-def simulated_arm(seed: int = 5) -> PyBulletArm:
-    return PyBulletArm(build("nominal", seed).plant())
+def simulated_arm(seed: int = 5) -> SimulatedArm:
+    return SimulatedArm(build("nominal", seed).plant())
 
 
 def parts(seed: int = 5):

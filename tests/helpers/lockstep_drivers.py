@@ -20,12 +20,12 @@ from drivers.fci.codec import ReplyParser, State, StateDecoder
 from drivers.fci.connect import Channel
 from drivers.fci.torque_control import TorqueControl
 from drivers.interface import Driver, DriverError, Intake, JointSample, PassedOn
-from drivers.pybullet_arm import PyBulletArm
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.fci.codec import RequestReader, read_command
 from sim.fci.robot import Reporter, Robot
 from sim.joint_effects import Obstacles
+from sim.plant import SimulatedArm
 from sim.scenarios import Scenario
 
 VERSION = 5
@@ -195,7 +195,7 @@ def opened(name: str, world: Scenario) -> Iterator[tuple[Driver, Obstacles]]:
     with ExitStack() as after:
         if name == "sim":
             plant = world.plant()
-            driver: Driver = PyBulletArm(plant)
+            driver: Driver = SimulatedArm(plant)
             obstacles = plant._engine.obstacles
         elif name == "fci":
             driver = robot = FciLockstep(world)

@@ -21,6 +21,7 @@ NOT_GIVEN = {
     "adapter sim fci --": "its options: tests/sim",
     "adapter excite": "minutes of search; tests/cli/test_excite.py gives it with a nearer goal",
     "write_a_driver.py": "given by tests/drivers/test_own_driver.py",
+    "so101": "of a data set that tests/docs/test_servo_hour.py makes",
     "adapter completion": "given by tests/cli/test_clumsy.py",
     "adapter experiment atlas": "a small one is given by tests/experiments/test_experiment.py",
 }

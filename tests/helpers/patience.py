@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
 
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
@@ -37,3 +38,11 @@ def connect(arm: Driver) -> None:
 def patient_read(arm: Driver) -> JointSample:
     """The next sample, of a new connection where the old one broke."""
     return patiently(arm.read, lambda: (arm.close(), arm.connect()))
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True

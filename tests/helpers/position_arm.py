@@ -9,7 +9,7 @@ error would show), so that the arm is moved by the simulator's own equations of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +39,9 @@ class Servos:
         noise_rad: standard deviation of an encoder's reading.
         table: what the hand comes down on: where on the last link (m), its height over the base's
             origin (m), and its stiffness (N/m); there is none where that is zero.
+        limit: N m, of what both gains ask for; dead: rad, of an error that drives nothing;
+            backlash: rad, of the gear, from end to end; servos steer by their motors, and readings
+            are of the links.
     """
 
     kp: Array
@@ -50,6 +53,9 @@ class Servos:
     feeds_speed: bool = True
     noise_rad: float = 2e-5
     table: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    limit: Array = field(default_factory=lambda: np.full(7, np.inf))
+    dead: Array = field(default_factory=lambda: np.zeros(7))
+    backlash: Array = field(default_factory=lambda: np.zeros(7))
 
 
 class Body(NamedTuple):
@@ -97,20 +103,59 @@ def record(
     """
     every, late = round(period_s / TICK_S), round(servos.delay_s / TICK_S)
     body = Body(truth.frames, truth.theta, truth.base, np.array(servos.table))
+    s = servos
     joints = np.array(
-        [servos.kp, servos.kd, servos.coulomb, servos.viscous, servos.armature], float
+        [s.kp, s.kd, s.coulomb, s.viscous, s.armature, s.limit, s.dead, s.backlash], float
     )
-    at, q = np.zeros((3, truth.n)), np.empty_like(commands)
-    at[0] = commands[0]
+    at, q = np.zeros((5, truth.n)), np.empty_like(commands)
+    at[0] = at[3] = commands[0]
     for tick in range(-round(SETTLE_S / TICK_S), len(commands) * every):
         if tick >= 0 and tick % every == 0:
             q[tick // every] = at[0]
         k = max((tick - late) // every, 0)
         speed = (commands[k] - commands[max(k - 1, 0)]) / period_s * servos.feeds_speed
-        move(body, joints, commands[k], speed, at)
+        step = move_with_backlash if s.backlash.any() else move
+        step(body, joints, commands[k], speed, at)
     q += servos.noise_rad * np.random.default_rng(seed).standard_normal(q.shape)
     stamp_ns = (np.arange(len(q)) * round(1e9 * period_s)).astype(np.int64)
     return PositionRecording(truth.joint_names, stamp_ns, q, commands)
+
+
+@compiled
+def driven(joints: Array, error: Array, slower: Array) -> Array:
+    """(n,) N m that servos ask of their motors, at errors of position and speed."""
+    kp, kd, limit, dead = joints[0], joints[1], joints[5], joints[6]
+    asked = kp * error * (np.abs(error) > dead) + kd * slower
+    return np.minimum(np.maximum(asked, -limit), limit)
+
+
+@compiled
+def move_with_backlash(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> None:
+    """As `move`, each motor behind a gap, whose ends are stiff springs with some damping.
+
+    Args:
+        at: (5, n) q, dq of the links, ddq (not used), q, dq of the motors, changed.
+    """
+    coulomb, viscous, armature, backlash = joints[2], joints[3], joints[4], joints[7]
+    n, h, still = len(goal), TICK_S / STEPS / 4, np.zeros(len(goal))
+    q, dq, _, motor, fast = at
+    inertia = mass_matrix(body.frames, body.theta, q)
+    stiff = np.minimum(np.diag(inertia), armature) * (0.3 / h) ** 2
+    for _ in range(4 * STEPS):
+        wound, slip = motor - q, fast - dq
+        into = np.sign(wound) * np.maximum(np.abs(wound) - 0.5 * backlash, 0.0)
+        carried = (stiff * into + 0.6 * stiff * h * slip) * (into != 0.0)
+        drive = driven(joints, goal - motor, speed - fast) - viscous * fast - carried
+        way = np.sign(fast)
+        for j in range(n):
+            if way[j] == 0.0 and abs(drive[j]) > coulomb[j]:
+                way[j] = np.sign(drive[j])
+        new = fast + h * (drive - way * coulomb) / armature * (way != 0.0)
+        fast[:] = new * (new * way > 0.0)
+        motor += h * fast
+        rigid = torques(body.frames, body.theta, body.base, q, dq, still)
+        dq += h * np.linalg.solve(inertia, carried - rigid)
+        q += h * dq
 
 
 @compiled
@@ -121,12 +166,13 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
     whose velocity would change its sign comes to rest.
 
     Args:
-        joints: (5, n) of `Servos`: kp, kd, coulomb, viscous, armature.
-        goal, speed: (n,) rad, rad/s; at: (3, n) q, dq and the last step's ddq, changed.
+        joints: (8, n) of `Servos`: kp, kd, coulomb, viscous, armature, limit, dead, backlash.
+        goal, speed: (n,) rad, rad/s; at: (5, n) q, dq and the last step's ddq, changed, and two
+            rows for motors with backlash.
     """
-    kp, kd, coulomb, viscous, armature = joints
+    coulomb, viscous, armature = joints[2:5]
     n, h, still = len(goal), TICK_S / STEPS, np.zeros(len(goal))
-    q, dq, last = at
+    q, dq, last, _, _ = at
     tip = np.eye(4)
     tip[:3, 3] = body.table[:3]
     inertia = mass_matrix(body.frames, body.theta, q)
@@ -135,7 +181,7 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
     for _ in range(STEPS):
         middle = dq + 0.5 * h * last
         midway = q + 0.5 * h * dq
-        drive = kp * (goal - midway) + kd * (speed - middle) - viscous * middle
+        drive = driven(joints, goal - midway, speed - middle) - viscous * middle
         drive -= torques(body.frames, body.theta, body.base, midway, middle, still)
         if body.table[4] > 0.0:
             pose, J = end_effector(body.frames, midway, tip)
@@ -202,7 +248,8 @@ class PositionArm:
         """True servos as their maker would write them down."""
         s, n = self.servos, self.truth.n
         numbers = (s.kp, s.kd, s.coulomb, s.viscous, s.armature, np.full(n, s.feeds_speed))
-        return ServoModel(self.truth.joint_names, *numbers, s.delay_s)
+        model = ServoModel(self.truth.joint_names, *numbers, s.delay_s)
+        return replace(model, torque_limit=s.limit, dead_band=s.dead, backlash=s.backlash)
 
     def true(self, effect: str) -> Array:
         """(n,) SI; of servos that know no command's speed the damping is all one."""
@@ -215,13 +262,22 @@ class PositionArm:
             "coulomb_friction": s.coulomb,
             "viscous_friction": s.viscous,
             "motor_inertia": s.armature,
+            "servo_torque_limit": s.limit,
+            "servo_dead_band": s.dead,
+            "backlash": s.backlash,
         }[effect]
 
     @property
     def expected(self) -> set[tuple[str, int]]:
         """(effect, joint from 1) of all that is to be named where nobody documented the servos."""
         alone = [e for e in EFFECTS if self.servos.feeds_speed or e != "viscous_friction"]
-        return {(effect, j + 1) for effect in alone for j in range(self.truth.n)}
+        none = {"servo_torque_limit": np.inf}
+        return {
+            (effect, j + 1)
+            for effect in alone
+            for j in range(self.truth.n)
+            if self.true(effect)[j] != none.get(effect, 0.0)
+        }
 
 
 def position_arm(seed: int, drawn: Drawn | None = None) -> PositionArm:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from adapter.errors import ModelWarning
+from adapter.model.robot_file import MOVING
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, rpy_from_matrix, z_to_axis
 from adapter.model.urdf import model_from_urdf
@@ -19,7 +21,17 @@ from adapter.physics.networks import FrameMotion
 
 SHARED = Path(__file__).parents[2].parent / "shared"
 PANDA = Path(__file__).parents[2] / "adapter" / "model" / "robots" / "panda.urdf"
-ROBOTS = ("panda", "atlas", "talos", "lwr4", "tree5", "tree17", "tree33", "tree60")
+# Joints of machines, each on the one before: T turns, S slides along its axis. Fingers come last.
+MACHINES = {
+    "rail": ("S x", "T z", "T y", "T y", "T x", "T y", "T x"),
+    "scara": ("T z", "T z", "S z", "T z"),
+    "gantry": ("S x", "S y", "S z", "T z"),
+    "gripper": ("T z", "T y", "T y", "T x", "S y", "S y"),
+}
+ROBOTS = (
+    *("panda", "atlas", "talos", "lwr4", "tree5", "tree17", "tree33", "tree60"),
+    *("mixed5", "mixed17", "mixed33", "mixed60", *MACHINES),
+)
 _FILES = {
     "atlas": "models/atlas_v5.urdf",
     "talos": "models/talos_reduced.urdf",
@@ -38,15 +50,40 @@ def shared(relative: str) -> Path:
 
 def urdf_text(name: str) -> str:
     """The URDF of a robot of `ROBOTS`."""
-    if name.startswith("tree"):
-        links = int(name.removeprefix("tree"))
-        return random_urdf(links, seed=links)
+    if name in MACHINES:
+        return machine_urdf(name)
+    for kind, sliding in (("tree", 0.0), ("mixed", 0.5)):
+        if name.startswith(kind):
+            links = int(name.removeprefix(kind))
+            return random_urdf(links, seed=links, sliding=sliding)
     path = PANDA if name == "panda" else shared(_FILES[name])
     return path.read_text()
 
 
-def random_urdf(links: int, seed: int) -> str:
-    """A tree of `links` moving links with any axes, some fixed links with mass among them."""
+def machine_urdf(name: str) -> str:
+    """One of `MACHINES`, its bodies at random; both fingers of a gripper are on its hand."""
+    rng, parts, parent, joints = np.random.default_rng(5), [], "base", MACHINES[name]
+    parts.append(_link("base", rng))
+    for k, joint in enumerate(joints):
+        kind, along = joint.split()
+        limit = '<limit lower="-0.8" upper="0.9" velocity="2" effort="300"/>'
+        xyz, axis = text_of(rng.uniform(0.05, 0.3, 3)), text_of(np.eye(3)["xyz".index(along)])
+        parts += [
+            _link(f"l{k + 1}", rng),
+            f'<joint name="j{k + 1}" type="{"revolute" if kind == "T" else "prismatic"}">'
+            f'<parent link="{parent}"/><child link="l{k + 1}"/><origin xyz="{xyz}" rpy="0 0 0"/>'
+            f'<axis xyz="{axis}"/>{limit}</joint>',
+        ]
+        parent = f"l{k + 1}" if name != "gripper" or kind == "T" else parent
+    return f'<robot name="{name}">\n' + "\n".join(parts) + "\n</robot>"
+
+
+def random_urdf(links: int, seed: int, sliding: float = 0.0) -> str:
+    """A tree of `links` moving links with any axes, some fixed links with mass among them.
+
+    Args:
+        links, seed: how many, and of what; sliding: share of the joints that slide.
+    """
     rng = np.random.default_rng(seed)
     parts = [_link("base", rng)]
     names = ["base"]
@@ -56,7 +93,7 @@ def random_urdf(links: int, seed: int) -> str:
         parent = names[int(rng.integers(max(0, len(names) - 6), len(names)))]
         fixed = bool(rng.random() < 0.25)
         moving += not fixed
-        parts += [_link(name, rng), _joint(name, parent, fixed, rng)]
+        parts += [_link(name, rng), _joint(name, parent, fixed, rng, sliding)]
         names.append(name)
     return '<robot name="random">\n' + "\n".join(parts) + "\n</robot>"
 
@@ -84,11 +121,14 @@ def link_text(name: str, mass: float, points: np.ndarray, origin: str) -> str:
     )
 
 
-def _joint(name: str, parent: str, fixed: bool, rng: np.random.Generator) -> str:
+def _joint(name: str, parent: str, fixed: bool, rng: np.random.Generator, sliding: float) -> str:
     special = bool(rng.random() < 0.5)
     axis = str(rng.choice(_SPECIAL_AXES)) if special else text_of(rng.normal(size=3))
     kind = "fixed" if fixed else str(rng.choice(["revolute", "continuous"]))
-    limit = '<limit lower="-2" upper="2" velocity="3" effort="50"/>' if kind == "revolute" else ""
+    if sliding and not fixed and rng.random() < sliding:
+        kind = "prismatic"
+    limit = '<limit lower="-2" upper="2" velocity="3" effort="50"/>'
+    limit = "" if kind == "continuous" else limit
     xyz = text_of(rng.normal(size=3) * 0.3)
     rpy = text_of(rpy_from_matrix(exp_rotation(rng.normal(size=3))))
     return (
@@ -98,10 +138,12 @@ def _joint(name: str, parent: str, fixed: bool, rng: np.random.Generator) -> str
 
 
 def read_quietly(text: str, floating: bool = False) -> SelfModel:
-    """The model of a URDF's text, warnings about locked joints aside."""
+    """The model of a URDF's text, warnings aside; all that slides is free where nothing mimics."""
+    kinds = re.findall(r'<joint name="([^"]*)" type="([^"]*)"', text)
+    joints = [name for name, kind in kinds if kind in MOVING]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
-        return model_from_urdf(text, floating=floating)
+        return model_from_urdf(text, joints=None if "<mimic" in text else joints, floating=floating)
 
 
 @dataclass

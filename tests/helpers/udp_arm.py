@@ -1,4 +1,4 @@
-"""A small arm that speaks the wire of `drivers/example_arm.py`, in a process of its own.
+"""A small arm that speaks the wire of `docs/examples/udp/example_arm.py`, in a process of its own.
 
     python tests/udp_arm.py --port 5800 --joints 6
 

@@ -40,9 +40,14 @@ def without_speed(data: TreeData) -> TreeData:
 
 
 @pytest.mark.parametrize("floating", [True, False])
-@pytest.mark.parametrize(("links", "seed"), [(5, 1), (9, 2), (12, 3)])
-def test_moments_find_every_frame_without_noise(links: int, seed: int, floating: bool) -> None:
-    text = random_urdf(links, seed)
+@pytest.mark.parametrize(
+    ("links", "seed", "sliding"),
+    [(5, 1, 0.0), (9, 2, 0.0), (12, 3, 0.0), (6, 4, 0.5), (11, 5, 0.5)],
+)
+def test_moments_find_every_frame_without_noise(
+    links: int, seed: int, sliding: float, floating: bool
+) -> None:
+    text = random_urdf(links, seed, sliding)
     model, data = samples(text, floating, 200, seed)
     _, control = samples(text, floating, 50, seed + 100)
     seen = frame_observability(model.tree, model.lam, model.gravity)

@@ -34,6 +34,7 @@ class Data:
 
     def __init__(self, seed: int, keep: float = 1.0) -> None:
         rng, samples = np.random.default_rng(seed), 40
+        self.slides, self.ddq = bool(seed % 2), rng.normal(size=samples)
         self.q, self.dq = rng.normal(size=(2, samples)) * 2.0
         self.parent, self.child = rng.normal(size=(2, samples, 12))
         self.R = exp_rotation(rng.normal(size=3))
@@ -41,7 +42,8 @@ class Data:
         self.M = np.zeros((3, 15, 15))
         self.s = np.full((samples, 3, 15), np.nan)
         for m in range(samples):
-            signals(self.q[m], self.dq[m], self.parent[m], self.child[m], self.s[m])
+            joint = self.q[m], self.dq[m], self.ddq[m]
+            signals(self.slides, joint, self.parent[m], self.child[m], self.s[m])
             accumulate(self.s[m], keep, self.M)
 
     def residuals(self, ch: int, R: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
@@ -50,9 +52,16 @@ class Data:
         cross = torch.linalg.cross
         P = p.expand_as(w)
         own = torch.from_numpy(self.child[:, (3, 0, 6)[ch] : (6, 3, 9)[ch]])
+        axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        q, dq, ddq = (torch.from_numpy(x)[:, None] * axis for x in (self.q, self.dq, self.ddq))
+        if self.slides:  # what the way along the axis makes, seen from the child
+            spin, turning = (torch.from_numpy(self.child[:, k : k + 3]) for k in (3, 9))
+            far = cross(turning, q) + cross(spin, cross(spin, q)) + 2.0 * cross(spin, dq) + ddq
+            own = own - (torch.zeros_like(q), dq + cross(spin, q), far)[ch]
+            return own - (w, v + cross(w, P), a + cross(dw, P) + cross(w, cross(w, P)))[ch] @ R
         if ch == 0:
             z = w
-            own = own - torch.from_numpy(self.dq)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+            own = own - dq
         elif ch == 1:
             z = v + cross(w, P)
         else:
@@ -175,7 +184,7 @@ def moments_of(motion: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
     M, s = np.zeros((2, 3, 15, 15)), np.zeros((3, 15))
     for m in range(len(motion)):
         for j in range(2):
-            signals(q[m, j], dq[m, j], motion[m, j], motion[m, j + 1], s)
+            signals(False, (q[m, j], dq[m, j], 0.0), motion[m, j], motion[m, j + 1], s)
             accumulate(s, 1.0, M[j])
     return M
 

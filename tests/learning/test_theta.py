@@ -12,7 +12,7 @@ from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.model.inertia import min_eigenvalue
 from adapter.model.self_model import SelfModel, Tool
-from adapter.physics.kernels import Frames, JointMotion, base_at_rest, regressors
+from adapter.physics.kernels import JointMotion, base_at_rest, placed, regressors
 from adapter.runs.outcome import collect, learned_model
 from adapter.signals.records import StateLayout
 from sim.scenarios import build
@@ -71,7 +71,7 @@ def batch_theta(learner: OnlineLearner, data: ArmData) -> np.ndarray:
     """Weighted batch least squares on the same filtered states, by numpy alone."""
     table = states_of(data)[::8]
     q, dq, ddq, tau = (np.ascontiguousarray(table[:, k]) for k in (AT.q, AT.dq, AT.ddq, AT.tau))
-    frames = Frames(np.arange(-1, N - 1), learner.schema.R0, learner.schema.p)
+    frames = placed(learner.tree, learner.schema.R0, learner.schema.p)
     Y = np.empty((len(q), N, 10 * N))
     regressors(frames, JointMotion(q, dq, ddq), base_at_rest(panda_model().gravity)[None], Y)
     theta, weight = np.zeros(10 * N), np.ones(N)

@@ -19,12 +19,14 @@ import pytest
 from adapter.effects.robots import robot_mjcf, robot_urdf
 from adapter.model.inertia import body_from_theta
 from adapter.model.self_model import SelfModel, Tool
-from adapter.model.spatial import rot_z, z_to_axis
+from adapter.model.spatial import at_joints, z_to_axis
 from adapter.model.urdf import parse_urdf
 from adapter.physics.rigid_arm import RigidArm
 from tests.helpers.robot_models import (
+    MACHINES,
     PANDA,
     SHARED,
+    machine_urdf,
     places_of,
     random_urdf,
     read_quietly,
@@ -51,6 +53,8 @@ ARMS = {
     "dressed": re.sub("<visual.*?</visual>", "", DRESSED, flags=re.DOTALL),
     "tree6": for_pybullet(random_urdf(6, seed=6)),
     "tree9": for_pybullet(random_urdf(9, seed=4)),
+    "mixed9": for_pybullet(random_urdf(9, seed=5, sliding=0.5)),
+    **{name: for_pybullet(machine_urdf(name)) for name in MACHINES},
     "hand": HAND.read_text() if HAND.exists() else for_pybullet(random_urdf(7, seed=7)),
 }
 
@@ -76,7 +80,9 @@ def ours(model: SelfModel, motion: Motion, centres: Points) -> Answer:
     frames, places = {-1: (np.zeros(3), np.eye(3))}, {}
     for k, name in enumerate(model.tree.link_names):
         p, r = frames[model.tree.parent[k]]
-        frames[k] = p + r @ model.lam[k, 3:], r @ model.joint_rotation()[k] @ rot_z(q[k])
+        zero = model.joint_rotation()[k], model.lam[k, 3:]
+        turn, place = at_joints(*zero, q[k], model.tree.slides[k])
+        frames[k] = p + r @ place, r @ turn
         places[name] = frames[k][0] + frames[k][1] @ z_to_axis(model.axis[k]).T @ centres[name]
     return Answer(tau, places)
 

@@ -21,6 +21,7 @@ from adapter.model.urdf import model_from_urdf, read_urdf
 from tests.helpers.robot_models import (
     PANDA,
     ROBOTS,
+    machine_urdf,
     pin_model,
     pinocchio_case,
     read_quietly,
@@ -100,8 +101,13 @@ def test_pybullets_panda_has_its_fingers_locked() -> None:
     assert "panda_finger_joint1" in said[0] and "panda_finger_joint2" in said[1]
     assert model.tree.joint_names == tuple(f"panda_joint{k}" for k in range(1, 8))
     assert model.theta[6, 0] == pytest.approx(0.2 + 0.81 + 0.1 + 0.1)
-    with pytest.raises(ModelError, match=r"panda_finger_joint1.*is prismatic.*panda_joint1"):
-        read_urdf(path, joints=["panda_joint1", "panda_finger_joint1"])
+    asked = [*model.tree.joint_names, "panda_finger_joint1"]
+    with pytest.warns(ModelWarning, match="mimics panda_finger_joint1, which moves"):
+        read_urdf(path, joints=asked)
+    with pytest.warns(ModelWarning, match="made up"):
+        free = read_urdf(path, joints=asked, lock={"panda_finger_joint2": 0.01})
+    assert free.tree.joint_names == tuple(asked) and free.tree.slides == (*7 * (False,), True)
+    assert free.theta[7, 0] == pytest.approx(0.1) and free.limits.upper[7] == 0.04
 
 
 def test_joints_not_asked_for_are_locked() -> None:
@@ -119,8 +125,18 @@ def test_mimic_joints_are_locked() -> None:
         '<joint name="panda_joint7" type="revolute">',
         '<joint name="panda_joint7" type="revolute"><mimic joint="panda_joint6"/>',
     )
-    with pytest.warns(ModelWarning, match="panda_joint7.*mimics another; locked at zero"):
+    with pytest.warns(ModelWarning, match="panda_joint7.*mimics panda_joint6, .*; locked at zero"):
         assert model_from_urdf(text).tree.n == 6
+
+
+@pytest.mark.parametrize(
+    ("robot", "free"), [("rail", 7), ("scara", 4), ("gantry", 4), ("gripper", 4)]
+)
+def test_what_slides_is_free_but_for_fingers(robot: str, free: int) -> None:
+    model = model_from_urdf(machine_urdf(robot))
+    assert model.tree.n == free
+    whole = read_quietly(machine_urdf(robot))
+    assert whole.theta[:, 0].sum() == pytest.approx(model.theta[:, 0].sum())
 
 
 def test_a_tool_is_kept_apart_and_counts_in_the_torques() -> None:
@@ -178,7 +194,7 @@ def with_joint(name: str, kind: str, parent: str, child: str) -> str:
 
 
 BAD = {
-    "prismatic": (spoilt(BC, BC.replace("revolute", "prismatic")), r"'bc'.*prismatic.*ab"),
+    "planar": (spoilt(BC, BC.replace("revolute", "planar")), r"'bc'.*planar.*ab"),
     "two roots": (spoilt(BC, ""), r"2 root links \(a, c\)"),
     "two parents": (with_joint("ac", "fixed", "a", "c"), r"'c'.*'bc' and 'ac'"),
     "circle": (robot(BC, JOINT.format("cb", "fixed", "c", "b", "")), r"links .* form a loop"),
@@ -215,7 +231,7 @@ def test_bad_files_are_refused_with_the_place_and_the_choices(fault: str, tmp_pa
     text, message = BAD[fault]
     path = tmp_path / "bad.urdf"
     path.write_text(text)
-    joints = ["ab", "bc"] if fault == "prismatic" else None
+    joints = ["ab", "bc"] if fault == "planar" else None
     with pytest.raises(ModelError, match=message) as caught, warnings.catch_warnings():
         warnings.simplefilter("error")
         read_urdf(path, joints=joints)

@@ -48,15 +48,16 @@ def test_networks_are_pinocchio(robot: str, floating: bool) -> None:
     assert relative(Y @ theta.reshape(-1), case.tau) < 1e-9
 
 
-def test_regressor_of_the_panda_is_pinocchios() -> None:
-    """Entry by entry: all axes of the Panda are z, so the frames are the same."""
-    text = urdf_text("panda")
+@pytest.mark.parametrize("robot", ["panda", "scara"])
+def test_regressor_is_pinocchios(robot: str) -> None:
+    """Entry by entry: all their axes are z, so the frames are the same."""
+    text = urdf_text(robot)
     case = pinocchio_case(text, floating=False)
     lam = torch.from_numpy(case.model.lam)
     mine = networks.regressor(case.model.tree, lam, (case.q, case.dq, case.ddq), case.base)
     oracle = pin_model(text)
     data = oracle.createData()
-    columns = np.concatenate([10 * k + np.array(PIN_ORDER) for k in range(7)])
+    columns = np.concatenate([10 * k + np.array(PIN_ORDER) for k in range(oracle.nv)])
     for k in range(len(case.q)):
         state = (case.q[k].numpy(), case.dq[k].numpy(), case.ddq[k].numpy())
         theirs = pin.computeJointTorqueRegressor(oracle, data, *state)[:, columns]
@@ -67,7 +68,7 @@ def test_regressor_of_the_panda_is_pinocchios() -> None:
 def test_gradients_of_the_networks(floating: bool) -> None:
     """gradcheck over λ, θ, joint signals and the base's motion."""
     torch.manual_seed(0)
-    tree = Tree((-1, 0, 0, -1), floating)
+    tree = Tree((-1, 0, 0, -1), floating, slides=(False, True, False, True))
     signals = [torch.randn(2, tree.n, dtype=DTYPE, requires_grad=True) for _ in range(3)]
     lam = torch.randn(tree.n, 6, dtype=DTYPE, requires_grad=True)
     theta = torch.randn(tree.bodies, 10, dtype=DTYPE, requires_grad=True)
@@ -96,7 +97,8 @@ class Random:
     def __init__(self, seed: int, floating: bool, moving: bool = True, m: int = 6) -> None:
         rng = np.random.default_rng([seed, floating, moving])
         n = int(rng.integers(2, 12))
-        self.tree = Tree(tuple(int(rng.integers(-1, k)) for k in range(n)), floating)
+        parent = tuple(int(rng.integers(-1, k)) for k in range(n))
+        self.tree = Tree(parent, floating, slides=tuple(rng.random(n) < 0.5 * (seed % 2)))
         self.lam, self.theta = rng.normal(size=(n, 6)), rng.normal(size=(self.tree.bodies, 10))
         self.joints = JointMotion(*(3.0 * rng.normal(size=(3, m, n))))
         self.gravity = 9.81 * rng.normal(size=3)
@@ -113,7 +115,7 @@ class Random:
         theta = torch.from_numpy(self.theta)
         self.tau = networks.inverse_dynamics(*self.given[:2], theta, *self.given[2:]).numpy()
         self.Y = networks.regressor(*self.given).numpy()
-        self.frames = frames_of(self.tree.parent, self.lam)
+        self.frames = frames_of(self.tree, self.lam)
 
 
 @pytest.fixture(params=[(False, False), (False, True), (True, True)], ids=["rest", "moved", "free"])
@@ -181,7 +183,7 @@ def test_compiled_transfer_of_wrenches_is_the_networks() -> None:
     """Link by link (eq. 14a), and to the base at once."""
     rng = np.random.default_rng(1)
     lam, q, W = rng.normal(size=(3, 6)), rng.normal(size=3), rng.normal(size=(6, 4))
-    chain = frames_of((-1, 0, 1), lam)
+    chain = frames_of(Tree((-1, 0, 1)), lam)
     R, o, out = np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((6, 4))
     kernels.place_frames(chain, q, R, o)
     kernels.transfer_wrench(R[2], o[2], W, out)

@@ -9,7 +9,7 @@ from adapter.model.spatial import exp_rotation, matrix_from_zxz, rot_z, rotation
 from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import frame_observability, random_motion
-from adapter.physics.kernels import Frames, base_at_rest, link_motions
+from adapter.physics.kernels import base_at_rest, link_motions, placed
 from tests.helpers.random_trees import cad_tree
 
 DOWN = np.array([0.0, 0.0, -9.81])
@@ -22,7 +22,7 @@ def motion(tree: Tree, R: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Motion of all links (50, n, 12) at random."""
     joints = random_motion(tree, 50, 3)
     out = np.empty((*joints.q.shape, 12))
-    frames = Frames(np.array(tree.parent), np.ascontiguousarray(R), np.ascontiguousarray(p))
+    frames = placed(tree, R, p)
     link_motions(frames, joints, base_at_rest(DOWN)[None], out)
     return out
 

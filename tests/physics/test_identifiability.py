@@ -17,7 +17,7 @@ from adapter.physics.identifiability import (
     random_motion,
 )
 from adapter.physics.networks import FrameMotion, inverse_dynamics, link_motion, link_step
-from tests.helpers.robot_models import pin_model, read_quietly, urdf_text
+from tests.helpers.robot_models import MACHINES, pin_model, read_quietly, urdf_text
 
 PANDA = documented("panda")
 COLUMNS = (
@@ -70,36 +70,42 @@ def test_frames_of_the_panda() -> None:
     assert found.flags[1].tolist() == [True, True, False, True, True, False]
 
 
+@pytest.mark.parametrize("robot", ["panda", "mixed5", *MACHINES])
 @pytest.mark.parametrize("gravity", [[0, 0, -9.81], [9.81, 0, 0], [5.0, -3.0, -7.0]])
-def test_frame_ranks_against_numerical_derivatives_of_the_whole_chain(gravity: list[float]) -> None:
+def test_frame_ranks_against_numerical_derivatives_of_the_whole_chain(
+    robot: str, gravity: list[float]
+) -> None:
     """The sum of per-joint ranks is the rank of all link motion over all turns and shifts."""
-    q, dq, ddq = (torch.from_numpy(x) for x in random_motion(PANDA.tree, 15, seed=5))
+    arm = read_quietly(urdf_text(robot))
+    tree, n = arm.tree, arm.tree.n
+    q, dq, ddq = (torch.from_numpy(x) for x in random_motion(tree, 15, seed=5))
     step = 1e-6
 
     def motion(turns: np.ndarray) -> np.ndarray:
-        lam = PANDA.lam.copy()
+        lam = arm.lam.copy()
         lam[:, :3] = zxz_from_matrix(exp_rotation(turns[:, :3]) @ matrix_from_zxz(lam[:, :3]))
         lam[:, 3:] += turns[:, 3:]
         base = torch.tensor(gravity, dtype=torch.float64)
-        k = link_motion(PANDA.tree, torch.from_numpy(lam), (q, dq, ddq), base)
+        k = link_motion(tree, torch.from_numpy(lam), (q, dq, ddq), base)
         return torch.cat(list(k), dim=-1).numpy().ravel()
 
     columns = []
-    for k in range(42):
-        turns = np.zeros(42)
+    for k in range(6 * n):
+        turns = np.zeros(6 * n)
         turns[k] = step
-        forward, back = motion(turns.reshape(7, 6)), motion(-turns.reshape(7, 6))
+        forward, back = motion(turns.reshape(n, 6)), motion(-turns.reshape(n, 6))
         columns.append((forward - back) / (2 * step))
-    found = frame_observability(PANDA.tree, PANDA.lam, np.array(gravity))
+    found = frame_observability(tree, arm.lam, np.array(gravity))
     rank, basis = numerical_rank(np.stack(columns, axis=1), tolerance=1e-6)
     assert found.rank == rank
-    whole = np.zeros((42, 42))
-    for j in range(7):
+    whole = np.zeros((6 * n, 6 * n))
+    for j in range(n):
         whole[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] = found.projectors[j]
     np.testing.assert_allclose(basis @ basis.T, whole, atol=1e-5)
 
 
-def test_frame_jacobian_against_numerical_derivatives() -> None:
+@pytest.mark.parametrize("slides", [False, True])
+def test_frame_jacobian_against_numerical_derivatives(slides: bool) -> None:
     """Equal up to the turn into the parent's axes, which JᵀJ does not see."""
     rng = np.random.default_rng(2)
     parent = rng.normal(size=(4, 1, 3))
@@ -110,12 +116,13 @@ def test_frame_jacobian_against_numerical_derivatives() -> None:
         turned = exp_rotation(change[:3]) @ matrix_from_zxz(lam_j[:3])
         lam = torch.from_numpy(np.r_[zxz_from_matrix(turned), lam_j[3:] + change[3:]])
         signals = (torch.from_numpy(x) for x in (q, dq, ddq))
-        k = link_step(FrameMotion(*(torch.from_numpy(x) for x in parent)), *signals, lam)
+        base = FrameMotion(*(torch.from_numpy(x) for x in parent))
+        k = link_step(base, tuple(signals), lam, slides)
         return torch.cat(list(k), dim=1).numpy()[0]
 
     step = 1e-6 * np.eye(6)
     numerical = np.stack([(motion(s) - motion(-s)) / 2e-6 for s in step], axis=1)
-    exact = frame_jacobian(parent.reshape(1, 12), dq, lam_j)
+    exact = frame_jacobian(parent.reshape(1, 12), (q, dq), lam_j, slides)
     np.testing.assert_allclose(exact.T @ exact, numerical.T @ numerical, rtol=1e-6)
 
 
@@ -133,7 +140,7 @@ def pinocchio_rank(text: str, floating: bool, seed: int = 0) -> int:
 
 
 @pytest.mark.parametrize("floating", [True, False])
-@pytest.mark.parametrize("robot", ["talos", "panda", "tree17", "tree33"])
+@pytest.mark.parametrize("robot", ["talos", "panda", "tree17", "mixed33", *MACHINES])
 def test_base_parameters_are_those_of_pinocchio(robot: str, floating: bool) -> None:
     text = urdf_text(robot)
     model = read_quietly(text, floating)
@@ -141,4 +148,5 @@ def test_base_parameters_are_those_of_pinocchio(robot: str, floating: bool) -> N
     found = base_parameters(model.tree, model.lam, model.gravity)
     assert found.rank == pinocchio_rank(text, floating)
     if floating:
-        assert found.rank == 10 + 7 * model.tree.n  # every revolute joint adds seven: a Panda 59
+        # every joint that turns adds seven (a Panda 59)
+        assert found.rank == 10 + 7 * model.tree.n or any(model.tree.slides)

@@ -14,7 +14,7 @@ from adapter.realtime.session import run_lockstep
 from adapter.realtime.snapshot import SnapshotError, SnapshotWriter
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.live_learners import nothing_known
 
@@ -195,7 +195,7 @@ def test_a_false_load_in_a_motion_stays_within_the_bound_and_the_motion_goes_on(
         apart = np.abs(tau - fed_back - model) - bound.at(ref.q, ref.dq, ref.ddq, none)
         beyond, share = max(beyond, apart.max()), max(share, np.abs(tau / limits.effort).max())
 
-    arm = PyBulletArm(build("nominal", 1).plant())
+    arm = SimulatedArm(build("nominal", 1).plant())
     try:
         result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=note)
     finally:

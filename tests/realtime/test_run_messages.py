@@ -9,7 +9,7 @@ import pytest
 from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_quaternion, matrix_from_zxz, zxz_from_matrix
 from adapter.model.urdf import model_from_urdf
-from adapter.realtime.run_messages import RunMessages, ShownArm
+from adapter.realtime.run_messages import RunMessages, ShownArm, nearest_frames
 from adapter.realtime.snapshot import ExternalTorque
 from drivers.files.estimates import EstimateNames
 from drivers.files.messages import decode
@@ -90,10 +90,19 @@ def test_what_no_motion_shows_is_shown_as_documented():
     R[0] = turn @ R[0]
     p[0] += [0.3, -0.2, 0.5]
     p[1] += [0.0, 0.0, 0.11]  # along the first joint's axis
+    off = np.zeros((7, 6))
+    off[3], p[3] = [0.0, 0.02, 0.0, 0.01, 0.0, -0.03], p[3] + [0.01, 0.0, -0.03]
+    R[3] = matrix_from_zxz(np.array([np.pi / 2, 0.02, -np.pi / 2])) @ R[3]  # about the parent's y
     lam = np.concatenate([zxz_from_matrix(R), p], axis=1)
-    found = ShownArm.of(model).shown.frames(lam)
-    assert np.allclose(found[0], matrix_from_zxz(model.lam[:, :3]), atol=1e-9)
-    assert np.allclose(found[1], model.lam[:, 3:], atol=1e-9)
+    arm = ShownArm.of(model)
+    found = nearest_frames(arm.freedom, lam, model.lam)
+    told = RunMessages(EstimateNames(model.tree.joint_names, model.tree.body_names, ()), arm)
+    (message,) = told.estimate(replace(nothing_known(7, 7, 0), lam=lam, version=1))
+    values = [[*joint["off"].values()] for joint in message.fields["joints"]]
+    np.testing.assert_allclose(values, off, atol=1e-9)
+    known = np.arange(7) != 3
+    assert np.allclose(found[0][known], matrix_from_zxz(model.lam[known, :3]), atol=1e-9)
+    assert np.allclose(found[1][known], model.lam[known, 3:], atol=1e-9)
 
 
 def test_a_wrench_is_told_in_the_last_links_axes():

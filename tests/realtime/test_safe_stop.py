@@ -38,7 +38,7 @@ if __name__ == "__main__":  # the workers load this file as well, and need none 
     from adapter.realtime.jobs import Jobs
     from adapter.realtime.loop import run_live
 
-    class Telling(tools.PyBulletArm):
+    class Telling(tools.SimulatedArm):
         def read(self):
             sample = super().read()
             if sample.stamp_ns % 20_000_000 == 0:

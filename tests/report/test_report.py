@@ -31,7 +31,7 @@ from adapter.runs.outcome import collect
 from adapter.runs.pipeline import Pipeline
 from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data, save_run
 from adapter.runs.score import Course, figures, reference_from
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.browser import (
     ids_of_a_whole_page,
@@ -53,7 +53,7 @@ def a_run(duration_s: float, **more) -> RunData:
     settings = PipelineSettings(learner=LearnerSettings(effects=("viscous_friction",)))
     pipeline = Pipeline(robot, settings)
     controller = ExcitationController(MotionLimits.of(robot), ExcitationSettings(seed=5))
-    arm = PyBulletArm(build("nominal", 5).plant())
+    arm = SimulatedArm(build("nominal", 5).plant())
     run = run_lockstep(arm, pipeline.front_end, pipeline.learner, controller, duration_s)
     outcome, front_end = collect(pipeline.learner), pipeline.front_end
     reference = reference_from(None, robot)

@@ -16,14 +16,14 @@ from adapter.runs.live import FIRST_S
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.run_folder import run_data
 from adapter.runs.score import Course, figures, reference_from
-from drivers.pybullet_arm import PyBulletArm
+from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.live_tools import PANDA, parts
 
 EVERY = 50  # states between two published estimates
 
 
-class OtherSign(PyBulletArm):
+class OtherSign(SimulatedArm):
     """The simulated arm behind a driver that tells the torque of joint 4 the other way."""
 
     def read(self):
@@ -31,7 +31,7 @@ class OtherSign(PyBulletArm):
         return replace(sample, tau=sample.tau * [1, 1, 1, -1, 1, 1, 1])
 
 
-@pytest.mark.parametrize("driver", [OtherSign, PyBulletArm])
+@pytest.mark.parametrize("driver", [OtherSign, SimulatedArm])
 def test_the_verdict_comes_first(driver, capsys, tmp_path) -> None:
     settings = PipelineSettings()
     learner = live.single_thread_learner(PANDA, settings, None, aloud=True)
@@ -54,7 +54,7 @@ def test_the_verdict_comes_first(driver, capsys, tmp_path) -> None:
     data = run_data(outcome, PANDA, numbers, known, first_moving_ns=times[0], delay_s=times[1])
     said = headline(data, Worth.of(data))[0]
     converged = [numbers[name]["converged_s"] is not None for name in ("lambda", "theta")]
-    if driver is PyBulletArm:
+    if driver is SimulatedArm:
         assert seen[-1][0] and all(converged) and told == ""
         assert numbers["lambda"]["converged_s"] < 2.0 and "The learned model" in said
         return

@@ -282,7 +282,7 @@ def test_faults_that_are_none_name_the_choices(text):
 
 def delivered(text, ticks=4000):
     """Ids of what leaves, in order, and the datagrams."""
-    spoiler, out = Spoiler([read_fault(text, KINDS)], 5), []
+    spoiler, out = Spoiler([text], 5), []
     for tick in range(ticks):
         out += [bytes(x) for x in spoiler.deliver(bytearray(struct.pack("<QQ", tick, 7)), tick)]
     whole = [struct.unpack_from("<Q", x)[0] for x in out if len(x) == 16 and x[8] == 7]
@@ -309,19 +309,19 @@ def test_network_faults():
 
 def test_sensor_faults():
     for text, name in (("nan=0.2", "nan"), ("spike=0.2", "spike")):
-        spoiler, frame, hits = Spoiler([read_fault(text, KINDS)], 1), StateFrame(5), 0
+        spoiler, frame, hits = Spoiler([text], 1), StateFrame(5), 0
         for tick in range(500):
             for key in ("q", "dq", "tau_J"):
                 frame.fields[key][:] = 0.0
-            spoiler.spoil_values(frame, tick)
+            spoiler.spoil_values(frame, tick / 1000)
             seen = np.concatenate([frame.fields[key] for key in ("q", "dq", "tau_J")])
             hits += np.isnan(seen).any() if name == "nan" else bool((np.abs(seen) > 0.1).any())
         assert hits == spoiler.counts[name] and 50 < hits < 150
     for text in ("stuck=3@1", "jump=3@1"):
-        spoiler, frame = Spoiler([read_fault(text, KINDS)], 1), StateFrame(10)
+        spoiler, frame = Spoiler([text], 1), StateFrame(10)
         for tick, expected in ((999, 0.999), (1000, 1.0), (1500, 1.5)):
             frame.fields["q"][:] = tick / 1000
-            spoiler.spoil_values(frame, tick)
+            spoiler.spoil_values(frame, tick / 1000)
             if text[0] == "s":
                 expected = min(expected, 1.0)
             else:

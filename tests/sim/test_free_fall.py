@@ -25,29 +25,15 @@ from sim.falls.data_set import (
 )
 from sim.falls.fall import TOP_SPEED, FallRecord, TreeTruth, atlas, babble
 from sim.truth import body_of
+from tests.helpers.arm_data import pin_tree
 from tests.helpers.random_trees import random_tree
 from tests.helpers.robot_models import read_quietly, shared
 
 EXACT = 1e-8
-PINOCCHIO_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # XX XY YY XZ YZ ZZ
 
 
 def tree_of(name: str) -> TreeTruth:
     return atlas() if name == "atlas" else random_tree(int(name), seed=int(name))
-
-
-def pinocchio_of(truth: TreeTruth) -> tuple[pin.Model, list[int]]:
-    """A model built joint by joint from the truth's numbers, and the number of each body in it."""
-    model = pin.Model()
-    model.gravity.linear = truth.gravity
-    numbers = [model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")]
-    for j, i in enumerate(truth.parent):
-        place = pin.SE3(truth.R[j], truth.p[j])
-        numbers.append(model.addJoint(numbers[i + 1], pin.JointModelRZ(), place, f"j{j}"))
-    for number, theta in zip(numbers, truth.theta, strict=True):
-        body = pin.Inertia.FromDynamicParameters(theta[PINOCCHIO_ORDER])
-        model.appendBodyToJoint(number, body, pin.SE3.Identity())
-    return model, numbers
 
 
 def answers(truth: TreeTruth, record: FallRecord, rows: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -56,9 +42,8 @@ def answers(truth: TreeTruth, record: FallRecord, rows: np.ndarray) -> tuple[np.
     The record's accelerations are already without gravity, so Pinocchio works without it too; the
     base's orientation then is of no account.
     """
-    model, numbers = pinocchio_of(truth)
-    model.gravity.linear = np.zeros(3)
-    data = model.createData()
+    model = pin_tree(truth.parent, truth.R, truth.p, truth.theta, np.zeros(3), free=True)
+    data, numbers = model.createData(), range(1, truth.n + 2)
     places = [model.joints[k].idx_v for k in numbers[1:]]
     wrenches, torques, motions, forces = [], [], [], []
     for k in rows:
@@ -91,8 +76,7 @@ def test_every_sample_satisfies_the_equations_of_motion(name: str) -> None:
     wrench, tau, motion, force = answers(truth, record, rows)
     assert np.abs(tau - record.tau[rows]).max() < EXACT * np.median(np.abs(tau))
     assert np.abs(wrench).max() < EXACT * np.median(force)
-    links = record.links(truth)
-    ours = np.stack([links.v, links.w, links.a, links.dw], axis=2)[rows]
+    ours = np.moveaxis(record.links(truth), 0, 2)[rows]
     assert np.abs(ours - motion).max() < 1e-11 * np.abs(motion).max()
     assert np.ptp(record.base_w, axis=0).min() > 0.1  # the base answers the limbs
 
@@ -231,7 +215,7 @@ def test_sensors_add_what_is_documented(tmp_path: Path) -> None:
     seen = data_set(TREE, noise=True, **options)[0]
     assert set(seen) == {"q", "dq", "tau", "base_w", "base_a", "link_w", "link_a"}
     assert all(np.all(np.isfinite(x)) for x in seen.values())
-    links = clean.links(TREE)
+    _, link_w, link_a, _ = clean.links(TREE)
     root_band = np.sqrt(500.0)
     gyro, accel = np.radians(0.007) * root_band, 120e-6 * 9.80665 * root_band
     step = 2 * np.pi / 2**19
@@ -242,8 +226,8 @@ def test_sensors_add_what_is_documented(tmp_path: Path) -> None:
         "tau": (clean.tau, 2e-3 * TREE.limits.effort),
         "base_w": (clean.base_w, gyro),
         "base_a": (clean.base_a, accel),
-        "link_w": (links.w, gyro),
-        "link_a": (links.a, accel),
+        "link_w": (link_w, gyro),
+        "link_a": (link_a, accel),
     }
     for key, (truth, size) in expected.items():
         error = (seen[key] - truth) / size

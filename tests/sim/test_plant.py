@@ -10,19 +10,16 @@ import pinocchio as pin
 import pytest
 
 from drivers.interface import DriverError
-from drivers.pybullet_arm import PyBulletArm
 from sim import dynamics
 from sim.dynamics import Frames
 from sim.effects import payload
 from sim.fci.arm import wrench_at
 from sim.noise import levels_of
-from sim.plant import Plant
+from sim.plant import Plant, SimulatedArm
 from sim.scenarios import build
 from sim.truth import panda, turn
-from tests.helpers.arm_data import pin_model, rms, rnea
+from tests.helpers.arm_data import pin_model, pin_tree, rms, rnea
 from tests.helpers.random_trees import random_tree
-
-PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # of our θ: Pinocchio has XX XY YY XZ YZ ZZ
 
 
 def oracle_motion(truth, q, dq, ddq):
@@ -44,28 +41,11 @@ def motion_of(model, q, dq, ddq, joints):
     return np.array(twist), np.array(accel)
 
 
-def tree_model(truth):
-    """A Pinocchio model of a tree with a free base."""
-    model = pin.Model()
-    model.gravity.linear = truth.gravity
-    at = [model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")]
-    model.appendBodyToJoint(at[0], _body(truth.theta[0]), pin.SE3.Identity())
-    for j, parent in enumerate(truth.parent):
-        place = pin.SE3(truth.R[j], truth.p[j])
-        name = truth.joint_names[j]
-        at.append(model.addJoint(at[parent + 1], pin.JointModelRZ(), place, name))
-        model.appendBodyToJoint(at[-1], _body(truth.theta[j + 1]), pin.SE3.Identity())
-    return model, at
-
-
-def _body(theta):
-    return pin.Inertia.FromDynamicParameters(theta[PIN_ORDER])
-
-
 @pytest.mark.parametrize("links", [5, 12, 40])
 def test_a_tree_that_tumbles_moves_and_pulls_as_pinocchio_says(links):
     truth, rng = random_tree(links, links), np.random.default_rng(links)
-    model, at = tree_model(truth)
+    model = pin_tree(truth.parent, truth.R, truth.p, truth.theta, truth.gravity, free=True)
+    at = range(1, truth.n + 2)
     frames = Frames(np.array(truth.parent), truth.R, truth.p)
     q, dq, ddq = (np.zeros(k) for k in (model.nq, model.nv, model.nv))
     q[:] = pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
@@ -305,7 +285,7 @@ def test_torque_is_cut_at_the_effort_limit_and_says_so():
 
 
 def test_leaving_the_range_of_a_joint_brakes_for_good():
-    arm = PyBulletArm(plant_of(panda()))
+    arm = SimulatedArm(plant_of(panda()))
     arm.connect()
     hold = arm.read().tau
     with pytest.raises(DriverError, match=r"panda_joint\d (left its range|exceeded its speed)"):
@@ -318,7 +298,7 @@ def test_leaving_the_range_of_a_joint_brakes_for_good():
 
 
 def test_driver_says_what_it_cannot_do():
-    arm = PyBulletArm(plant_of(panda()))
+    arm = SimulatedArm(plant_of(panda()))
     with pytest.raises(DriverError, match="connect"):
         arm.read()
     arm.connect()

@@ -7,14 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfreqz
 
 from adapter.model.robots import documented as known
 from adapter.model.robots import facts_of as facts_about
 from drivers.interface import JointSample
 from sim.dynamics import end_effector
 from sim.joint_effects import Obstacles
-from sim.noise import BAND_HZ, RATE_HZ, SensorNoise, band_response, levels_of
+from sim.noise import SensorNoise, levels_of
 from sim.options import ROBOTS, SCENARIOS
 from sim.scenarios import build
 from sim.truth import FLANGE, facts_of, panda, turn
@@ -50,13 +49,6 @@ def test_torque_is_quantised_as_on_a_real_panda():
     tau = np.array([plant.read().tau for _ in range(200)])
     steps = tau / [0.0357, 0.0357, 0.0357, 0.0357, 0.0055, 0.0064, 0.0064]
     assert steps == pytest.approx(np.round(steps), abs=1e-6)
-
-
-def test_the_band_filter_is_scipys_butterworth():
-    sections = butter(2, BAND_HZ, btype="bandpass", fs=RATE_HZ, output="sos")
-    f, found = band_response()
-    _, expected = sosfreqz(sections, worN=f[:-1], fs=RATE_HZ)
-    np.testing.assert_allclose(found[:-1], expected, atol=1e-12)
 
 
 def test_link_noise_has_its_size_and_is_settable():

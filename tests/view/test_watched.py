@@ -53,6 +53,7 @@ FOUND = {
     "size": {"Fv": 0.75},
     "score": 9.0,
     "ambiguous_with": [{"what": "coulomb_friction", "joints": [2]}],
+    "line": "viscous friction (or coulomb friction) since 1.5 s",
 }
 EVERY = 50  # states between two looks
 TICK_NS = 200_000
@@ -374,18 +375,19 @@ def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
     np.testing.assert_array_equal(state.position, now.q)
     np.testing.assert_array_equal(got["/residuals"][-1][1].effort, now.residual)
     np.testing.assert_array_equal(got["/external_torques"][-1][1].effort, np.arange(7.0) + 10.0)
-    theta = got["/theta"][-1][1]
-    assert [dim.size for dim in theta.layout.dim] == [7, 10] and theta.layout.dim[0].stride == 70
-    np.testing.assert_array_equal(theta.data, now.view.snapshot.theta.ravel())
-    assert got["/load"][-1][1].data == [0.5231, 0.0112]
+    told = got["/estimates"][-1][1]
+    assert [body.value.m for body in told.bodies] == now.view.snapshot.theta[:, 0].tolist()
+    assert (got["/load"][-1][1].mass, got["/load"][-1][1].mass_std) == (0.5231, 0.0112)
     assert got["/state"][-1][1].data == now.headline
-    assert got["/findings"][-1][1].data.startswith("viscous friction (or coulomb")
+    assert got["/findings"][-1][1].status[0].message == FOUND["line"]
+    assert got["/timing"][-1][1].ticks >= now.view.timing.of("loop_us").count
     assert got["/robot_description"][-1][1].data.lstrip().startswith("<?xml")
     model = pin.buildModelFromUrdf(str(PANDA_URDF))  # both arms' hands stand where it puts them
     data = model.createData()
     pin.forwardKinematics(model, data, now.q)
     chain = {x.child_frame_id: x for x in got["/tf"][-1][1].transforms}
-    for prefix in ("", "learned/"):
+    assert {x.header.frame_id for x in got["/tf_static"][-1][1].transforms} >= {"world"}
+    for prefix in ("documented/", "learned/"):
         place, name = pin.SE3.Identity(), prefix + PANDA.tree.link_names[-1]
         while name in chain:
             step = chain[name]
@@ -393,7 +395,7 @@ def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
             turned = pin.Quaternion(turn.w, turn.x, turn.y, turn.z).matrix()
             place = pin.SE3(turned, np.array([shift.x, shift.y, shift.z])) * place
             name = step.header.frame_id
-        assert name == PANDA.tree.base_name
+        assert name == prefix + PANDA.tree.base_name
         np.testing.assert_allclose(place.homogeneous, data.oMi[7].homogeneous, atol=1e-6)
 
 
@@ -401,9 +403,9 @@ def _feed(shown: FoxgloveView, now: Now) -> None:
     view = now.view
     for k in range(40):  # a subscription takes a moment
         view = replace(view, elapsed_s=view.elapsed_s + 3.0)
-        snapshot = replace(view.snapshot, version=100 + k)
-        shown(replace(now, view=replace(view, snapshot=snapshot)))
-        shown._told.clear()
+        new = [replace(part, version=100 + k) for part in (view.snapshot, view.push)]
+        timing = replace(view.timing, bins=view.timing.bins + k)
+        shown(replace(now, view=replace(view, snapshot=new[0], push=new[1], timing=timing)))
         time.sleep(0.05)
     shown._server.stop()
 

@@ -25,13 +25,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from adapter.experiments.baselines.features import Columns
-from adapter.experiments.baselines.learner import Baseline, Progress, Told, accelerator
-from adapter.learning.batch.prediction_errors import LEAST_TORQUE
+from adapter.experiments.baselines.learner import Baseline, Columns, Progress, Told, accelerator
+from adapter.learning.batch.prediction_errors import LEAST_TORQUE, predicted_torques
+from adapter.learning.batch.theta_factors import row_factors, scales, system
+from adapter.learning.batch.theta_solvers import least_squares_theta
+from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
-from adapter.physics.identifiability import RANK_TOLERANCE
-from adapter.physics.networks import DTYPE, PER_BODY, FrameMotion, regressor
+from adapter.physics.networks import FrameMotion
 
 BASE_ROWS = 6  # [v; w] of the carrier come before the joints in x
 LEAST_DIAGONAL = 1e-3  # of the scaled Cholesky factor, so that M stays invertible
@@ -194,58 +195,42 @@ class DeepLagrangian(Baseline):
 class RegressorLeastSquares(Baseline):
     """Inertial parameters of an arm from its torques, weighted by joint, smallest norm."""
 
-    at_once = 5_000  # so that their regressor stays below 30 MB
-
     def __init__(self, columns: Columns, parents: Sequence[int], lam: Array) -> None:
         """With a known body schema.
 
         Args:
             columns: layout of X.
             parents: for each joint of the arm the arm's link that it hangs on, -1 for the
-                carrier (`features.sub_parents`).
+                carrier (`sub_parents`).
             lam: (n, 6) λ of these joints.
         """
         self.tree = Tree(tuple(parents), floating=True)
-        self.columns, self.lam = columns, torch.as_tensor(np.asarray(lam), dtype=DTYPE)
+        self.columns, self.lam = columns, np.asarray(lam, dtype=np.float64)
 
     def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
         """Solve with equal weights, then with each joint's rest as its noise."""
         self.columns.check(X, Y)
-        width = PER_BODY * self.tree.n + 1
-        triangles: list[Array] = [np.zeros((0, width)) for _ in range(self.tree.n)]
-        for k in range(0, len(X), self.at_once):
-            rows = self._rows(X[k : k + self.at_once])
-            for j, old in enumerate(triangles):
-                new = np.column_stack([rows[:, j], Y[k : k + self.at_once, j]])
-                triangles[j] = np.asarray(np.linalg.qr(np.vstack([old, new]), mode="r"))
-            progress(f"least squares: {min(k + self.at_once, len(X))} of {len(X)} samples")
-        size = np.maximum(np.sqrt(np.mean(Y**2, axis=0)), 1e-9)
-        theta, rank = _solved(triangles, size)
-        rest = [np.linalg.norm(r[:, :-1] @ theta - r[:, -1]) for r in triangles]
-        # no joint's torque is taken for better than this share of its size
-        noise = np.maximum(np.array(rest) / np.sqrt(len(X)), 1e-12 * size)
-        self._theta, rank = _solved(triangles, noise)
-        return {"samples": len(X), "parameters": PER_BODY * self.tree.n, "rank": rank}, (
+        every = row_factors(self._samples(X, Y), self.lam)
+        rows = [row for row in every if row.kind == "torque"]  # nothing measures the wrench
+        progress(f"least squares: {len(X)} samples are taken in")
+        std = size = scales(rows)
+        theta, links = np.zeros((self.tree.bodies, 10)), tuple(range(1, self.tree.bodies))
+        for _ in range(2):
+            found = least_squares_theta(*system(rows, std, links), np.zeros((self.tree.n, 10)))
+            theta[1:] = found.theta
+            # no joint's torque is taken for better than this share of its size
+            std = np.maximum([row.residual(theta) for row in rows], 1e-12 * size)
+        self._theta = theta
+        return {"samples": len(X), "parameters": theta[1:].size, "rank": found.rank}, (
             "λ is known; θ by weighted least squares (QR), the weights from each joint's rest, "
             "the solution of smallest norm.",
         )
 
-    def _rows(self, x: Array) -> Array:
-        """Regressor of the joint torques, (m, n, 10 n); the carrier's own inertia is in none."""
-        q, dq, ddq = (torch.from_numpy(np.ascontiguousarray(s)) for s in self.columns.joints(x))
-        full = regressor(
-            self.tree, self.lam, (q, dq, ddq), FrameMotion.of(self.columns.carrier(x).rows())
-        )
-        return full[:, 6:, PER_BODY:].numpy()
+    def _samples(self, x: Array, y: Array | None = None) -> TreeData:
+        """Rows of X as samples of the arm as a tree on its carrier."""
+        tau = np.zeros((len(x), self.tree.rows))
+        tau[:, BASE_ROWS:] = 0.0 if y is None else y
+        return TreeData(self.tree, *self.columns.joints(x), tau, self.columns.carrier(x))
 
     def _answer(self, x: Array) -> Array:
-        return np.asarray(self._rows(x) @ self._theta)
-
-
-def _solved(triangles: list[Array], noise: Array) -> tuple[Array, int]:
-    """θ (10 n,) of the joints' triangular systems, each over its noise; and the rank found."""
-    table = np.vstack([r / s for r, s in zip(triangles, noise, strict=True)])
-    length = np.linalg.norm(table[:, :-1], axis=0)
-    length = np.where(length > 0.0, length, 1.0)
-    found, _, rank, _ = np.linalg.lstsq(table[:, :-1] / length, table[:, -1], rcond=RANK_TOLERANCE)
-    return found / length, int(rank)
+        return predicted_torques(self._samples(x), self.lam, self._theta)[:, BASE_ROWS:]

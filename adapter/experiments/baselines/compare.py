@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from adapter.experiments.baselines.by_physics import DeepLagrangian, RegressorLeastSquares
-from adapter.experiments.baselines.features import Columns, arm_problem
-from adapter.experiments.baselines.learner import Baseline
+from adapter.experiments.baselines.learner import Baseline, Columns, arm_problem
 from adapter.experiments.baselines.paper import MEMBERS, ElmCommittee, FeedForward, GaussianProcess
 from adapter.experiments.falls import SETS, TRAIN_SHARE, Falls, Split, sets_of
 from adapter.experiments.results import BOX_PERCENTILES, LearnerScores
@@ -153,11 +152,10 @@ def compare(
         errors = Errors(sets["train"][1].shape[1])
         for name, (x, y) in judged.items():
             errors.add(name, y, learner.predict(x))
-        facts = learner.facts()
-        sizes = ", ".join(f"{value:,.6g} {what}" for what, value in facts.sizes.items())
-        learned = LearnerScores(choice.key, choice.title, train_s=facts.train_s)
-        learned.sizes, learned.selection = dict(facts.sizes), selection
-        learned.tuning = [sizes, *facts.tuning, _told(choice, selection)]
+        sizes = ", ".join(f"{value:,.6g} {what}" for what, value in learner.sizes.items())
+        learned = LearnerScores(choice.key, choice.title, train_s=learner.train_s)
+        learned.sizes, learned.selection = dict(learner.sizes), selection
+        learned.tuning = [sizes, *learner.tuning, _told(choice, selection)]
         found.append(errors.into(learned))
     return found
 

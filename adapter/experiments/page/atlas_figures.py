@@ -14,8 +14,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
-from adapter.experiments.page.words import OURS, SETS, baselines, fopnet, grouped, letter, with_unit
+from adapter.experiments.falls import SETS
+from adapter.experiments.page.words import LETTERS, OURS, grouped, with_unit
 from adapter.experiments.results import AtlasResults, LearnerScores
+from adapter.experiments.stated import PAPER_BASELINES
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
@@ -177,44 +179,35 @@ def fit_to(drawing: Drawing, shown: Sequence[Skeleton]) -> None:
     )
 
 
-def histogram_panels(atlas: AtlasResults) -> tuple[Panel | None, Panel | None]:
-    """Kinematic errors of the networks' λ (Fig. 4f) and of the moments'; None without any."""
-    error = "errors |k − k̂|"
-    samples = atlas.numbers.get("learned_samples")
-    on = "the samples" if samples is None else f"the {grouped(samples)} samples"
+def histogram_panels(atlas: AtlasResults) -> tuple[Panel, Panel]:
+    """Kinematic errors of the networks' λ (Fig. 4f) and of the moments'."""
+    error, edges = "errors |k − k̂|", atlas.error_edges
+    on = f"the {grouped(atlas.numbers['learned_samples'])} samples"
+    note = f"λ of (d), from mini-batches, on {on} it learned from"
+    beside = "on the same samples; “FOPnet, moments” takes this λ"
     return (
-        _histogram(
-            atlas.error_edges,
-            atlas.error_counts,
-            f"(f) Kinematic {error}",
-            f"λ of (d), from mini-batches, on {on} it learned from",
-        ),
-        _histogram(
-            atlas.error_edges,
-            atlas.moments_error_counts,
-            f"λ from moments: {error}",
-            "on the same samples; “FOPnet, moments” takes this λ",
-        ),
+        _histogram(edges, atlas.error_counts, f"(f) Kinematic {error}", note),
+        _histogram(edges, atlas.moments_error_counts, f"λ from moments: {error}", beside),
     )
 
 
-def _histogram(
-    log_edges: Array, by_kind: Mapping[str, Array], title: str, note: str
-) -> Panel | None:
-    """How large the kinematic errors are, by kind."""
-    edges = np.asarray(log_edges, dtype=float)
+def _histogram(edges: Array, by_kind: Mapping[str, Array], title: str, note: str) -> Panel:
+    """How large the kinematic errors are, by kind; `edges` (bins + 1,) are logarithms."""
     counts = {kind: np.asarray(c, float) for kind, c in by_kind.items() if sum(c) > 0.0}
-    if not counts:
-        return None
     drawing = Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
     for k, (kind, values) in enumerate(counts.items()):
-        name, unit = KINDS.get(kind, (kind, ""))
+        name, unit = KINDS[kind]
         share = PERCENT * values / values.sum()
-        label, color = f"{name} {kind}, {unit}".rstrip(", "), joint_color(k)
+        label, color = f"{name} {kind}, {unit}", joint_color(k)
         ax.stairs(share, 10.0**edges, color=color, fill=True, alpha=0.18)
         ax.stairs(share, 10.0**edges, color=color, linewidth=1.2, label=label)
-    _magnitudes(ax, edges, sum(counts.values(), np.zeros(len(edges) - 1)))
+    # A logarithmic x axis around what is counted, with the goal in it.
+    used = np.flatnonzero(sum(counts.values()))
+    first, last = 10.0 ** (edges[used[0]] - 0.5), 10.0 ** (edges[used[-1] + 1] + 0.5)
+    ax.set_xscale("log")
+    ax.set_xlim(min(first, 0.25 * KINEMATIC_GOAL), max(last, 4.0 * KINEMATIC_GOAL))
+    log_ticks(ax.xaxis, LogLocator(10, numticks=7), power_of_ten)
     ax.set_ylim(0.0, 1.5 * ax.dataLim.y1)  # room for the legend, which the goal must not cross
     low, high = np.log10(ax.get_xlim())
     side = "right" if np.log10(KINEMATIC_GOAL) < 0.5 * (low + high) else "left"
@@ -225,47 +218,29 @@ def _histogram(
     return drawing.panel(title, "% of their kind", f"{note}; {grouped(most)} numbers of a kind")
 
 
-def _magnitudes(ax: Axes, edges: Array, counts: Array) -> None:
-    """A logarithmic x axis around what is counted, with the goal in it."""
-    used = np.flatnonzero(counts)
-    low, high = edges[used[0]], edges[used[-1] + 1]
-    ax.set_xscale("log")
-    first, last = 10.0 ** (low - 0.5), 10.0 ** (high + 0.5)
-    ax.set_xlim(min(first, 0.25 * KINEMATIC_GOAL), max(last, 4.0 * KINEMATIC_GOAL))
-    log_ticks(ax.xaxis, LogLocator(10, numticks=7), power_of_ten)
-
-
 def schema_panels(atlas: AtlasResults) -> list[Panel]:
     """λ's cost while it is learned, and its error at the epochs of the pictures."""
-    panels = []
-    cost = np.asarray(atlas.cost, dtype=float)
+    cost = atlas.cost
     good = np.isfinite(cost) & (cost > 0.0)
-    if good.sum() > 1:
-        drawing = Drawing("third", stretch=STRETCH)
-        ax = drawing.axes[0]
-        ax.plot(*thin(np.flatnonzero(good).astype(float), cost[good]), color=ACCENT, linewidth=1.2)
-        log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
-        ax.set_xlim(0.0, 1.04 * len(cost))
-        time_axis(drawing, "step of the optimiser")
-        panels.append(drawing.panel("Cost of λ, eq. 18", "m²/s² + rad²/s²", "mean over the joints"))
-    if atlas.snapshots:
-        panels.append(_epoch_errors(atlas))
-    return panels
+    drawing = Drawing("third", stretch=STRETCH)
+    ax = drawing.axes[0]
+    ax.plot(*thin(np.flatnonzero(good).astype(float), cost[good]), color=ACCENT, linewidth=1.2)
+    log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
+    ax.set_xlim(0.0, 1.04 * len(cost))
+    time_axis(drawing, "step of the optimiser")
+    panel = drawing.panel("Cost of λ, eq. 18", "m²/s² + rad²/s²", "mean over the joints")
+    return [panel, _epoch_errors(atlas)]
 
 
 def _epoch_errors(atlas: AtlasResults) -> Panel:
     """One dot per joint: how far its frame is from the actual one in its parent's."""
     n = atlas.tree.n
     lam = np.stack([lam for _, lam in atlas.snapshots])
-    off = frame_errors(lam, atlas.true_lam, Freedom.none(n))
-    kinds = zip(("turn, rad", "shift, m"), off, strict=True)
+    off = np.maximum(frame_errors(lam, atlas.true_lam, Freedom.none(n)), SMALLEST)
     drawing = Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
     at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)
-    shown = []
-    for k, (name, errors) in enumerate(kinds):
-        errors = np.maximum(errors, SMALLEST)
-        shown.append(errors)
+    for k, (name, errors) in enumerate(zip(("turn, rad", "shift, m"), off, strict=True)):
         side, color = -0.18 + 0.36 * k, (ACCENT, GOAL)[k]
         ax.plot(
             (at + side).ravel(),
@@ -277,8 +252,7 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
             alpha=0.75,
             label=name,
         )
-    low, high = np.min(shown), np.max(shown)
-    log_axis(ax, 0.3 * low, 5.0 * high)
+    log_axis(ax, 0.3 * off.min(), 5.0 * off.max())
     categories(ax, [label for label, _ in atlas.snapshots])
     legend(ax, loc="best")
     return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")
@@ -286,20 +260,20 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
 
 def arm_rows(atlas: AtlasResults, learner: LearnerScores) -> dict[str, Array]:
     """By set the boxes (arm joints, 5) of a learner of the whole tree or of the arm alone."""
-    boxes = {name: learner.boxes[name] for name in SETS if name in learner.boxes}
     whole, arm = atlas.tree.n, list(atlas.arm)
-    return {name: rows[arm] if len(rows) == whole else rows for name, rows in boxes.items()}
+    return {k: rows[arm] if len(rows) == whole else rows for k, rows in learner.boxes.items()}
 
 
 def arm_panels(atlas: AtlasResults) -> tuple[list[Panel], list[Panel]]:
     """Relative errors of the arm's joints, a panel per learner: the paper's four, then others."""
-    shared = _limits(*(box for x in baselines(atlas) for box in arm_rows(atlas, x).values()))
+    known = [x for x in atlas.learners if x.name in PAPER_BASELINES]
+    shared = _limits(*(box for x in known for box in arm_rows(atlas, x).values()))
     paper: list[tuple[str, Panel]] = []
     others: list[Panel] = []
     for learner in atlas.learners:
         rows = arm_rows(atlas, learner)
-        which = letter(learner)
-        limits = shared if which in ("a", "b", "c") else _limits(*rows.values())
+        which = LETTERS.get(learner.name)
+        limits = shared if learner in known else _limits(*rows.values())
         if limits is None:
             continue
         drawing = _boxes(rows, atlas.arm, limits)
@@ -336,9 +310,7 @@ def not_judged(atlas: AtlasResults) -> list[int]:
 
 def whole_panels(atlas: AtlasResults) -> list[Panel]:
     """FOPnet's relative errors of all joints, in as many panels as they need."""
-    ours = fopnet(atlas)
-    if ours is None or any(len(ours.boxes.get(s, ())) == len(atlas.arm) for s in SETS):
-        return []
+    ours = atlas.learners[0]
     limits = _limits(*ours.boxes.values())
     if limits is None:
         return []
@@ -346,41 +318,36 @@ def whole_panels(atlas: AtlasResults) -> list[Panel]:
     panels = []
     for joints in np.array_split(np.arange(atlas.tree.n), count):
         part = joints.tolist()
-        drawing = _boxes({s: ours.boxes[s][part] for s in SETS if s in ours.boxes}, part, limits)
+        drawing = _boxes({name: rows[part] for name, rows in ours.boxes.items()}, part, limits)
         title = f"(d) {OURS}, joints {part[0] + 1} to {part[-1] + 1}"
         panels.append(drawing.panel(title, "relative error, %"))
     return panels
 
 
 def side_by_side(atlas: AtlasResults) -> Panel | None:
-    """Median and 99th percentile of every learner on one scale; None without any."""
-    known = [x for x in atlas.learners if any(s in x.median for s in SETS)]
-    values = [v for x in known for v in (*x.median.values(), *x.p99.values())]
-    limits = _limits(np.array(values))
+    """Median and 99th percentile of every learner on one scale; None where no torque was judged."""
+    limits = _limits(*([*x.median.values(), *x.p99.values()] for x in atlas.learners))
     if limits is None:
         return None
     drawing = Drawing("half", stretch=STRETCH)
     ax = drawing.axes[0]
-    for k, learner in enumerate(known):
+    for k, learner in enumerate(atlas.learners):
         for side, name in zip((-0.2, 0.0, 0.2), SETS, strict=True):
-            middle, high = _shown(learner.median.get(name)), _shown(learner.p99.get(name))
+            errors = np.array([learner.median[name], learner.p99[name]])
+            middle, high = PERCENT * np.maximum(errors, SMALLEST)
             color = SET_COLORS[name]
             ax.plot([k + side] * 2, [middle, high], color=color, linewidth=2.0, alpha=0.45)
             ax.plot([k + side], [middle], "o", color=color, markersize=4.5)
             ax.plot([k + side], [high], "_", color=color, markersize=7)
     log_axis(ax, *limits)
-    categories(ax, [x.name for x in known])
+    categories(ax, [x.name for x in atlas.learners])
     note = "dot: median; bar up to the 99th percentile, over all joints that the learner has"
     return drawing.panel("All learners on one scale", "relative error, %", note)
 
 
-def _shown(fraction: float | None) -> float:
-    return PERCENT * max(np.nan if fraction is None else fraction, SMALLEST)
-
-
-def _limits(*tables: Array) -> tuple[float, float] | None:
+def _limits(*tables: Array | list[float]) -> tuple[float, float] | None:
     """Whole decades in per cent, with some room, around all finite values; None without any."""
-    values = np.concatenate([np.ravel(x) for x in tables]) if tables else np.zeros(0)
+    values = np.concatenate([np.zeros(0), *map(np.ravel, tables)])
     values = values[np.isfinite(values)]
     if not len(values):
         return None
@@ -399,8 +366,6 @@ def _boxes(
     width = 0.72 / len(SETS)
     log_axis(ax, *limits)
     for k, name in enumerate(SETS):
-        if name not in rows:
-            continue
         whisker, first, middle, third, end = PERCENT * np.maximum(rows[name], SMALLEST).T
         x = np.arange(len(joints)) + (k - 1.0) * width
         color = SET_COLORS[name]

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from adapter.experiments.page.atlas_figures import KINDS
-from adapter.experiments.page.words import grouped, scientific, with_unit
+from adapter.experiments.page.words import scientific, with_unit
 from adapter.experiments.results import AtlasResults, PandaResults
 from adapter.gap.phrases import listed
-from adapter.model.numbers import DASH
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
@@ -38,9 +37,9 @@ def beyond(atlas: AtlasResults | None, panda: PandaResults | None) -> dict[str, 
     robots = [
         (name, results.numbers["discover"])
         for name, results in (("ATLAS", atlas), ("Panda", panda))
-        if results is not None and results.numbers.get("discover", {}).get("trials")
+        if results is not None and results.numbers["discover"]["trials"]
     ]
-    online = {} if atlas is None else atlas.numbers.get("online", {})
+    online = {} if atlas is None else atlas.numbers["online"]
     if not robots and not online:
         return None
     return {
@@ -76,31 +75,27 @@ def _share(confidence: float) -> str:
 
 def _channels(measured: str) -> str:
     """Channels by name: "w, a" is angular velocity and acceleration."""
-    return listed([KINDS.get(x, (x, ""))[0] for x in measured.split(", ")])
+    return listed([KINDS[x][0] for x in measured.split(", ")])
 
 
 def online_table(online: Mapping[str, Any]) -> Table | None:
     """How fast the online learner is on the whole tree, and what it shows; None without any."""
     if not online:
         return None
-    settled = online.get("lambda_settled_s")
-    rank, joints = online.get("lambda_rank"), online.get("joints")
-    shown = DASH
-    if rank is not None and joints is not None:
-        shown = f"{grouped(rank)} of {grouped(6 * joints)}"
+    settled = online["lambda_settled_s"]
     steps = [
-        with_unit(1e-3 * us, "ms", 3) if us is not None and us >= 1e3 else with_unit(us, "µs", 3)
-        for us in map(online.get, ("step_p50_us", "step_p99_us"))
+        with_unit(1e-3 * us, "ms", 3) if us >= 1e3 else with_unit(us, "µs", 3)
+        for us in (online["step_p50_us"], online["step_p99_us"])
     ]
     rows = [
-        ["samples a second, on one core", with_unit(online.get("samples_per_second"), "1/s", 3)],
+        ["samples a second, on one core", with_unit(online["samples_per_second"], "1/s", 3)],
         ["time of a sample, median", steps[0]],
         ["time of a sample, 99th percentile", steps[1]],
         [
             "λ settled, θ begins after",
             "not reached" if settled is None else with_unit(settled, "s", 3),
         ],
-        ["directions of λ shown", shown],
+        ["directions of λ shown", f"{online['lambda_rank']} of {6 * online['joints']}"],
     ]
     return Table(["", "ATLAS"], rows)
 
@@ -109,14 +104,15 @@ def online_panels(history: Sequence[Mapping[str, float]]) -> list[Panel]:
     """Torque error over least squares', and λ's error, against seconds learned from."""
     if not history:
         return []
-    t = _column(history, "seconds")
+    over = {key: np.array([row[key] for row in history]) for key in history[0]}
+    t = over["seconds"]
     ratios: list[Line] = [
-        ("all joints", _column(history, "over_least_squares"), ACCENT),
-        ("worst joint", _column(history, "worst_joint_over_least_squares"), MUTED),
+        ("all joints", over["over_least_squares"], ACCENT),
+        ("worst joint", over["worst_joint_over_least_squares"], MUTED),
     ]
     errors: list[Line] = [
-        ("turn, rad", _column(history, "turn_rad"), ACCENT),
-        ("shift, m", _column(history, "shift_m"), GOAL),
+        ("turn, rad", over["turn_rad"], ACCENT),
+        ("shift, m", over["shift_m"], GOAL),
     ]
     note = "on a motion never learned from; 1 is least squares on all samples seen so far"
     return [
@@ -127,10 +123,6 @@ def online_panels(history: Sequence[Mapping[str, float]]) -> list[Panel]:
             "ATLAS online: error of λ", "rad, m", "of the joint whose frame is farthest off"
         ),
     ]
-
-
-def _column(history: Sequence[Mapping[str, float]], key: str) -> Array:
-    return np.array([row.get(key, math.nan) for row in history], dtype=float)
 
 
 def _plot(t: Array, lines: Sequence[Line], goal: float | None) -> Drawing:

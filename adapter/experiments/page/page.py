@@ -8,23 +8,25 @@ from typing import Any
 
 import numpy as np
 
+from adapter.experiments.falls import SETS
 from adapter.experiments.page import atlas_figures as figures
 from adapter.experiments.page import figure6, words
 from adapter.experiments.page.beyond import beyond
-from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
+from adapter.experiments.results import AtlasResults, PandaResults, Stated
+from adapter.experiments.stated import PAPER_BASELINES
 from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.numbers import DASH
+from adapter.model.spatial import Array
 from adapter.report.html import fill
 from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW
 
-PAPER_LEARNERS = (
-    ("a", "the feed-forward network"),
-    ("b", "the committee of extreme learning machines"),
-    ("c", "the Gaussian process"),
-    ("d", words.OURS),
+BASELINES = (
+    "the feed-forward network",
+    "the committee of extreme learning machines",
+    "the Gaussian process",
 )
 
 
@@ -75,11 +77,9 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
 
 def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
     """Key figures of section IV.A, those that there are."""
-    found = []
-    ours, best, times = words.fopnet(atlas), words.best_baseline(atlas), words.advantage(atlas)
-    if ours is not None and "control" in ours.median:
-        value = words.percent(ours.median["control"])
-        found.append(Tile(f"{words.OURS}, control set", value, "median relative error, eq. 20"))
+    value = words.percent(atlas.learners[0].median["control"])
+    found = [Tile(f"{words.OURS}, control set", value, "median relative error, eq. 20")]
+    best, times = words.best_baseline(atlas), words.advantage(atlas)
     if best is not None:
         value = words.percent(best.median["control"])
         found.append(Tile("Best baseline, control set", value, f"{best.name}; median, eq. 20"))
@@ -91,8 +91,8 @@ def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
 
 def panda_tiles(panda: PandaResults) -> list[Tile]:
     """Key figures of section IV.B, those that there are."""
-    after, ratio = words.measured(panda.stated, "lambda_converged_s"), words.last_ratio(panda)
-    value = "not reached" if after is None else words.with_unit(after, "s", 3)
+    after, ratio = words.converged(panda).ours, words.last_ratio(panda)
+    value = "not reached" if after is None else words.with_unit(float(after), "s", 3)
     found = [Tile("λ of the simulated Panda converged", value, "after the first motion")]
     if ratio is not None:
         found.append(
@@ -108,13 +108,14 @@ def panda_tiles(panda: PandaResults) -> list[Tile]:
 def _atlas(atlas: AtlasResults) -> dict[str, Any]:
     histogram, moments = figures.histogram_panels(atlas)
     paper, others = figures.arm_panels(atlas)
+    names = {learner.name for learner in atlas.learners}
     summary = figures.side_by_side(atlas)
     tuning = [(x.name, x.title.rstrip("."), words.sentences(x.tuning)) for x in atlas.learners]
     return {
         "n": atlas.tree.n,
         "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figures.limbs(atlas.tree)],
-        "schema": [*figures.epoch_panels(atlas), *([histogram] if histogram else [])],
-        "schema_more": [*([moments] if moments else []), *figures.schema_panels(atlas)],
+        "schema": [*figures.epoch_panels(atlas), histogram],
+        "schema_more": [moments, *figures.schema_panels(atlas)],
         "not_converged": _not_converged(atlas),
         "paper": paper,
         "whole": figures.whole_panels(atlas),
@@ -122,7 +123,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
         "last": [figures.arm_panel(atlas), *([summary] if summary else [])],
         "arm": arm_joints(atlas),
         "not_judged": _not_judged(atlas),
-        "compared": bool(words.baselines(atlas)),
+        "compared": not names.isdisjoint(PAPER_BASELINES),
         "full": atlas.full,
         "stated": stated_table(atlas.stated),
         "learners": learner_table(atlas),
@@ -137,10 +138,10 @@ def arm_joints(atlas: AtlasResults) -> str:
 
 def _not_converged(atlas: AtlasResults) -> str:
     """Which networks of Fig. 4 did not find their joint's frame; empty where all did."""
-    names, samples = atlas.not_converged, atlas.numbers.get("learned_samples")
+    names = atlas.not_converged
     if not names:
         return ""
-    few = "too few samples" if samples is None else f"too few samples ({words.grouped(samples)})"
+    few = f"too few samples ({words.grouped(atlas.numbers['learned_samples'])})"
     if len(names) == atlas.tree.n:
         return f"None of the {atlas.tree.n} joints had converged; {few}."
     whose = f"{len(names)} joint{'' if len(names) == 1 else 's'} had not converged"
@@ -163,61 +164,46 @@ def _not_judged(atlas: AtlasResults) -> str:
 
 def _atlas_reasons(atlas: AtlasResults) -> list[str]:
     """What of Figs. 4 and 5 is missing, and why."""
-    reasons = []
     kept = {label for label, _ in atlas.snapshots}
-    if not atlas.snapshots:
-        reasons.append("Fig. 4a-d: no epochs of λ's training were kept.")
-    for label, which in figures.EPOCH_LETTERS.items():
-        if kept and label not in kept:
-            reasons.append(f"Fig. 4{which}: λ's training has no {label}, it ended before.")
-    if not any(sum(counts) for counts in atlas.error_counts.values()):
-        reasons.append("Fig. 4f: no kinematic errors were counted.")
-    have = {words.letter(learner) for learner in atlas.learners if learner.boxes}
-    for which, name in PAPER_LEARNERS:
-        if which not in have:
-            reasons.append(f"Fig. 5{which}: {name} was not run.")
-    return reasons
+    names = {learner.name for learner in atlas.learners}
+    return [
+        *(
+            f"Fig. 4{which}: λ's training has no {label}, it ended before."
+            for label, which in figures.EPOCH_LETTERS.items()
+            if label not in kept
+        ),
+        *(
+            f"Fig. 5{words.LETTERS[name]}: {learner} was not run."
+            for name, learner in zip(PAPER_BASELINES, BASELINES, strict=True)
+            if name not in names
+        ),
+    ]
 
 
-def stated_table(items: Sequence[Stated]) -> Table | None:
-    """What the paper states, what we measured, what differs; None without any."""
+def stated_table(items: Sequence[Stated]) -> Table:
+    """What the paper states, what we measured, what differs."""
     rows = [[x.what, x.paper or "not stated", words.ours_text(x), x.note] for x in items]
-    return Table(["", "Paper states", "We measured", "Remark"], rows) if rows else None
+    return Table(["", "Paper states", "We measured", "Remark"], rows)
 
 
-def learner_table(atlas: AtlasResults) -> Table | None:
-    """A row per learner and set: errors, and how long it trained; None without any."""
-    if not atlas.learners:
-        return None
+def learner_table(atlas: AtlasResults) -> Table:
+    """A row per learner and set: errors, and how long it trained."""
     heads = ["Learner", "Joints", "Training", "Set", "Median", "99th percentile", "RMSE"]
     units = ["", "", "", "", "eq. 20", "eq. 20", "by joint, N m"]
     rows = []
     for learner in atlas.learners:
-        known = [s for s in words.SETS if s in learner.median or s in learner.rmse] or [DASH]
-        for name in known:
-            first = name == known[0]
-            row = [learner.name, _joints(learner), words.with_unit(learner.train_s, "s", 3)]
-            rows.append(
-                [
-                    *(row if first else [""] * len(row)),
-                    name,
-                    words.percent(learner.median.get(name)),
-                    words.percent(learner.p99.get(name)),
-                    _spread(learner.rmse.get(name)),
-                ]
-            )
+        joints, train = str(len(learner.rmse[SETS[0]])), words.with_unit(learner.train_s, "s", 3)
+        row = [learner.name, joints, train]
+        for name in SETS:
+            errors = map(words.percent, (learner.median[name], learner.p99[name]))
+            rows.append([*row, name, *errors, _spread(learner.rmse[name])])
+            row = [""] * len(row)
     return Table(heads, rows, units)
 
 
-def _joints(learner: LearnerScores) -> str:
-    known = {len(x) for x in (*learner.rmse.values(), *learner.boxes.values())}
-    return str(max(known)) if known else DASH
-
-
-def _spread(values: np.ndarray | None) -> str:
+def _spread(values: Array) -> str:
     """Smallest to largest over the joints."""
-    finite = np.asarray([] if values is None else values, dtype=float)
-    finite = finite[np.isfinite(finite)]
+    finite = values[np.isfinite(values)]
     if not len(finite):
         return DASH
     low, high = words.scientific(float(finite.min())), words.scientific(float(finite.max()))

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
+from adapter.experiments.stated import PAPER_BASELINES
 from adapter.model.numbers import DASH
 from adapter.report.style import SUPERSCRIPTS
 from adapter.report.words import NARROW, count, number
 
 OURS = "FOPnet"
-# The paper's Fig. 5 by the first word of a learner's name, without regard to capitals.
-LETTERS = {"ffnn": "a", "elm": "b", "gpr": "c", "fopnet": "d"}
-SETS = ("train", "test", "control")
+# The parts of the paper's Fig. 5 by the learner that they show.
+LETTERS = dict(zip((*PAPER_BASELINES, OURS), "abcd", strict=True))
 PLAIN_FROM, PLAIN_TO = 1e-3, 1e4  # between them a number needs no power of ten
 ATLAS_LEFT_OUT = "Section IV.A was not run: “adapter experiment atlas” makes Figs. 4 and 5."
 PANDA_LEFT_OUT = "Section IV.B was not run: “adapter experiment panda” makes Fig. 6."
@@ -94,47 +94,21 @@ def ours_text(item: Stated) -> str:
     return with_unit(value, item.unit, 3)
 
 
-def letter(learner: LearnerScores) -> str:
-    """Which part of the paper's Fig. 5 shows this learner; empty where none does."""
-    first = learner.name.replace("-", " ").split()[:1]
-    return LETTERS.get(first[0].lower(), "") if first else ""
-
-
-def fopnet(atlas: AtlasResults) -> LearnerScores | None:
-    """The learner of the paper."""
-    return next((x for x in atlas.learners if letter(x) == LETTERS["fopnet"]), None)
-
-
-def baselines(atlas: AtlasResults) -> list[LearnerScores]:
-    """The paper's three."""
-    return [x for x in atlas.learners if letter(x) in ("a", "b", "c")]
-
-
 def best_baseline(atlas: AtlasResults) -> LearnerScores | None:
     """Of the paper's three the one with the smallest median error on the control set."""
-    name = atlas.numbers.get("best_baseline")
-    return next((x for x in baselines(atlas) if x.name == name), None)
+    return next((x for x in atlas.learners if x.name == atlas.numbers["best_baseline"]), None)
 
 
 def advantage(atlas: AtlasResults) -> float | None:
     """How many times smaller FOPnet's median control error is than the best baseline's, both of
     the joints that the baselines learn."""
-    ratio = atlas.numbers.get("control_error_ratio_to_best_baseline")
+    ratio = atlas.numbers["control_error_ratio_to_best_baseline"]
     return ratio if ratio is not None and math.isfinite(ratio) and ratio > 0.0 else None
 
 
-def of(items: Sequence[Stated], key: str) -> Stated | None:
-    """The figure with that key, if there is one."""
-    return next((item for item in items if item.key == key), None)
-
-
-def measured(items: Sequence[Stated], key: str) -> float | None:
-    """Our value of the figure with that key, if it is a finite number."""
-    item = of(items, key)
-    value = None if item is None else item.ours
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        return None
-    return float(value)
+def converged(panda: PandaResults) -> Stated:
+    """When λ had converged, beside what the paper says."""
+    return next(item for item in panda.stated if item.key == "lambda_converged_s")
 
 
 def last_ratio(panda: PandaResults) -> float | None:
@@ -152,13 +126,10 @@ def atlas_sentence(atlas: AtlasResults | None) -> str:
     """How FOPnet does on ATLAS, beside the best of the paper's baselines."""
     if atlas is None:
         return "ATLAS was not run."
-    ours = fopnet(atlas)
-    if ours is None or "control" not in ours.median:
-        return f"ATLAS ({atlas.tree.n} joints) was run without {OURS} on the control set."
     said = (
         f"On control trajectories {OURS} predicts the joint torques of ATLAS "
         f"({atlas.tree.n} joints) with a median relative error of "
-        f"{percent(ours.median['control'])}"
+        f"{percent(atlas.learners[0].median['control'])}"
     )
     best, times = best_baseline(atlas), advantage(atlas)
     if best is None:
@@ -175,21 +146,17 @@ def panda_sentence(panda: PandaResults | None) -> str:
     """How fast and how well the Panda learns itself."""
     if panda is None:
         return "The Panda was not run."
-    at = of(panda.stated, "lambda_converged_s")
-    after = measured(panda.stated, "lambda_converged_s")
-    if after is None:
-        said = "The simulated Panda's λ did not converge"
+    at, joined = converged(panda), ", and"
+    if at.ours is None:
+        said, joined = "The simulated Panda's λ did not converge", "; in the end"
     else:
-        theirs = (
-            f" (the paper's real arm: {at.paper.replace(' ', NARROW)})"
-            if at is not None and at.paper
-            else ""
+        after_s, theirs = with_unit(float(at.ours), "s"), at.paper.replace(" ", NARROW)
+        said = (
+            f"The simulated Panda's λ converges {after_s} after the first motion "
+            f"(the paper's real arm: {theirs})"
         )
-        after_s = with_unit(after, "s")
-        said = f"The simulated Panda's λ converges {after_s} after the first motion{theirs}"
     ratio = last_ratio(panda)
     if ratio is None or not math.isfinite(panda.theta_start_s):
         return f"{said}; its θ was not learned."
-    joined = ", and" if after is not None else "; in the end"
     error = f"its torque error is {scientific(ratio, 3)}"
     return f"{said}{joined} {error} times that of batch least squares."

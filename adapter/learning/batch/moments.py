@@ -72,30 +72,33 @@ def schema_moments(data: TreeData) -> SchemaMoments:
     check_motion(data)
     base, links = data.base.rows(), data.links.rows()
     sums = np.zeros((data.tree.n, len(CHANNELS), WIDTH, WIDTH))
-    parent = np.array(data.tree.parent, dtype=np.int64)
-    _accumulate(parent, JointMotion(data.q, data.dq, data.ddq), base, links, sums)
+    tree = np.array(data.tree.parent, dtype=np.int64), np.array(data.tree.slides)
+    _accumulate(tree, JointMotion(data.q, data.dq, data.ddq), base, links, sums)
     if not with_speed:
         sums[:, CHANNELS.index("v")] = 0.0
     return SchemaMoments(sums, len(data), with_speed)
 
 
 @jit
-def _accumulate(parent, joints, base, links, sums):
+def _accumulate(tree, joints, base, links, sums):
     """Add every sample: `JointMotion`, base (m, 12), links (m, n, 12) to sums (n, 4, 15, 15)."""
-    q, dq, ddq = joints
+    (parent, slides), (q, dq, ddq) = tree, joints
     s = np.zeros((3, 15))
     turn = np.zeros(6)
     for m in range(q.shape[0]):
         for j in range(parent.shape[0]):
             up = base[m] if parent[j] < 0 else links[m, parent[j]]
-            signals(q[m, j], dq[m, j], up, links[m, j], s)
+            at, speed, gain = q[m, j], dq[m, j], ddq[m, j]
+            signals(slides[j], (at, speed, gain), up, links[m, j], s)
             accumulate(s, 1.0, sums[j])
             # 8d as R0^T dw_i = Rz(q)(dw_j - ddq z - w_j x z dq)
-            x = links[m, j, 9] - links[m, j, 4] * dq[m, j]
-            y = links[m, j, 10] + links[m, j, 3] * dq[m, j]
-            c, sn = np.cos(q[m, j]), np.sin(q[m, j])
+            if slides[j]:
+                at, speed, gain = 0.0, 0.0, 0.0
+            x = links[m, j, 9] - links[m, j, 4] * speed
+            y = links[m, j, 10] + links[m, j, 3] * speed
+            c, sn = np.cos(at), np.sin(at)
             turn[0], turn[1] = c * x - sn * y, sn * x + c * y
-            turn[2] = links[m, j, 11] - ddq[m, j]
+            turn[2] = links[m, j, 11] - gain
             for k in range(3):
                 turn[3 + k] = up[9 + k]
             for a in range(6):

@@ -59,7 +59,7 @@ def kinematic_errors(data: TreeData, lam: Array) -> KinematicErrors:
     channels = [name for name in CHANNELS if name != "v" or with_speed]
     worst = {name: np.zeros(data.tree.n) for name in channels}
     counts = {name: np.zeros(len(EDGES) - 1, dtype=np.int64) for name in channels}
-    frames = frames_of(data.tree.parent, lam)
+    frames = frames_of(data.tree, lam)
     for start in range(0, len(data), CHUNK):
         part = data.take(slice(start, start + CHUNK))
         found = np.empty((*part.q.shape, 12))
@@ -84,7 +84,7 @@ def predicted_torques(data: TreeData, lam: Array, theta: Array) -> Array:
     check_dynamics(data)
     check_finite({"λ": lam, "θ": theta})
     tau = np.empty(data.tau.shape)
-    frames = frames_of(data.tree.parent, lam)
+    frames = frames_of(data.tree, lam)
     torques(frames, np.ascontiguousarray(theta), data.joints(), data.base.rows(), tau)
     return tau
 

@@ -62,7 +62,7 @@ def row_factors(data: TreeData, lam: Array) -> list[RowFactor]:
         raise ModelError("θ can't be learned from no samples")
     check_dynamics(data)
     check_finite({"tau": data.tau, "λ": lam})
-    frames, rows = frames_of(tree.parent, lam), _rows(tree)
+    frames, rows = frames_of(tree, lam), _rows(tree)
     factors = [np.zeros((0, 10 * len(bodies) + 1)) for *_, bodies in rows]
     for start in range(0, len(data), CHUNK):
         part = data.take(slice(start, start + CHUNK))

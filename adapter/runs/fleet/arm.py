@@ -320,7 +320,7 @@ def _own_effects(theta: Theta, information: Array, side: Array, rmse: Array) -> 
     shape = theta.effect_values.shape
     at = np.arange(theta.P - theta.effect_values.size, theta.P)
     bodies = np.arange(at[0]) if len(at) else np.arange(theta.P)
-    spread = np.repeat(theta.effect_spread, theta.tree.n)
+    spread = (theta.effect_spread[:, None] * theta.drums).ravel()
     own = information[np.ix_(at, at)] + np.diag(1.0 / spread**2)
     right = side[at] - information[np.ix_(at, bodies)] @ theta.th[bodies]
     found = np.linalg.solve(own, right + theta.th[at] / spread**2)

@@ -20,9 +20,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.address import Address
-from drivers.interface import Array, DriverError, Intake, JointSample
+from drivers.interface import Array, DriverError, Intake, JointSample, checked_torques
 
-DEFAULT_PORT, DEFAULT_JOINTS, DEFAULT_HZ, DEFAULT_TIMEOUT_MS = 5800, 6, 1000.0, 100.0
+DEFAULT_PORT = 5800
 OPTIONS = ("joints", "hz", "timeout_ms")
 HEADER = struct.Struct("<QQ")
 COUNTER = struct.Struct("<Q")
@@ -53,13 +53,13 @@ class ExampleArm:
     ) -> None:
         place = Address.of(address, OPTIONS)
         self._where = (place.host, place.port or DEFAULT_PORT)
-        n = int(_positive(place, "joints", DEFAULT_JOINTS))
+        n = int(place.number("joints", 6, 1, 100))
         names = joint_names or [f"joint{j}" for j in range(1, n + 1)]
         if len(names) != n:
             raise DriverError(f"{address}: {n} joints, but {len(names)} names; add joints={n}")
         self.joint_names = tuple(names)
-        self.period_ns = round(1e9 / _positive(place, "hz", DEFAULT_HZ))
-        self._timeout_s = 1e-3 * _positive(place, "timeout_ms", DEFAULT_TIMEOUT_MS)
+        self.period_ns = round(1e9 / place.number("hz", 1000.0, 1e-3, 1e6))
+        self._timeout_s = 1e-3 * place.number("timeout_ms", 100.0, 1e-3, 1e6)
         self.can_move = allow_motion
         self.intake, self.arrived_ns = Intake(), 0
         self._socket: socket.socket | None = None
@@ -157,12 +157,8 @@ class ExampleArm:
         self._open()
         if not self.can_move:
             raise DriverError(f"{self._name}: listens only; motion needs --allow-motion")
-        wanted = np.asarray(tau, dtype="<f8")
-        n = len(self.joint_names)
-        if wanted.shape != (n,) or not np.isfinite(wanted).all():
-            said = str(tau).replace("\n", " ")
-            raise DriverError(f"{self._name}: command {said} is not {n} finite torques in N m")
-        self._send(COUNTER.pack(self._counter or 0) + wanted.tobytes())
+        wanted = checked_torques(tau, len(self.joint_names))
+        self._send(COUNTER.pack(self._counter or 0) + wanted.astype("<f8").tobytes())
 
     def stop(self) -> None:
         """Ask the arm to brake; without a connection its own watch on commands has done so."""
@@ -190,15 +186,3 @@ class ExampleArm:
     @property
     def _name(self) -> str:
         return f"udp://{self._where[0]}:{self._where[1]}"
-
-
-def _positive(place: Address, key: str, default: float) -> float:
-    """An option as a number above zero. Raises DriverError."""
-    text = place.options.get(key)
-    try:
-        value = default if text is None else float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < 1e9 or (key == "joints" and value != int(value)):
-        raise DriverError(f"udp://{place.host}: {key}={text} is not a number above zero")
-    return value

@@ -1,0 +1,222 @@
+"""What was found of a position-controlled arm's servos, on one self-contained page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from adapter.gap import servo_words
+from adapter.gap.phrases import shown_unit, who
+from adapter.gap.servo import EFFECTS, ServoGap
+from adapter.gap.servo_arms import ServoNumber
+from adapter.model.numbers import DASH, plain, plus_minus
+from adapter.report.gap_panels import fall_drawing, rollout_drawing, worst_window
+from adapter.report.gap_tables import tied
+from adapter.report.html import fill
+from adapter.report.next_steps import Step, command
+from adapter.report.style import Panel
+from adapter.report.tables import Table, Tile
+from adapter.report.trust import GOOD, LOOK, Check
+from adapter.report.words import NARROW, capital
+
+SHARE, CLOSE_MRAD = 0.25, 4.0  # of the error before; or so small: the joint is explained
+MOST_SHOWN = 6  # joints whose worst moment is drawn
+TITLES = tuple(title for title, _, _ in EFFECTS.values())  # what the table has, not the headline
+SLOW_RAD_S, MOSTLY = 0.1, 0.5  # where more than that share of what is left is
+
+
+def render_servo_page(
+    gap: ServoGap, model: str, servos: Path, beside: Sequence[ServoNumber] = ()
+) -> str:
+    """The page as HTML text.
+
+    Args:
+        model: as the command had it; servos: the file they are in.
+        beside: numbers of this arm and of others of its kind.
+    """
+    tiles, joints = _tiles(gap), [f"joint {j + 1}" for j in range(len(gap.joint_names))]
+    parts = [x for x in servo_words.headline(gap).split("; ") if not x.startswith(TITLES)]
+    parts.sort(key=lambda text: not text.startswith("tracking error"))
+    panels = []
+    for what, factor, unit, (before, after) in (
+        ("Tracking error", 1e3, "mrad rms", (gap.before, gap.after)),
+        ("At the hand", 1e3, "mm rms", (gap.hand_before[:-1], gap.hand_after[:-1])),
+    ):
+        drawing = fall_drawing(factor * before, factor * after, None, joints)
+        note = f"of {gap.hand}, by each joint's error alone" if unit == "mm rms" else ""
+        panels.append(drawing.panel(f"{what} by joint", unit, note))
+    return fill(
+        "servo.html",
+        {
+            "robot": gap.model_name,
+            "headline": [f"{tied(capital(x.replace(' -> ', ' → ')))}." for x in parts],
+            "recordings": list(dict.fromkeys(name for name, _ in gap.curves)),
+            "scored": gap.scored,
+            "tiles": tiles,
+            "columns": len(tiles),
+            "found": _found(gap),
+            "open": list(dict.fromkeys(f.open for f in gap.findings if f.open)),
+            "ground": capital(servo_words.grounded(gap)) if gap.ground.root > 0.0 else "",
+            "errors": panels,
+            "error_table": _errors(gap),
+            "moments": _moments(gap),
+            "odd": [text for number in beside for text in number.sentences()],
+            "arms": _arms(beside),
+            "checks": _checks(gap),
+            "steps": _steps(gap, model, servos),
+            "notes": gap.notes,
+            "provenance": [
+                ("Recordings", ", ".join(gap.recordings)),
+                ("Model", model),
+                ("Servos", str(servos)),
+            ],
+        },
+    )
+
+
+def _arrow(before: float, after: float, unit: str) -> str:
+    said = f"{plain(1e3 * before, 2)} → {plain(1e3 * after, 2)} {unit}"
+    return said.replace(" ", NARROW)
+
+
+def _tiles(gap: ServoGap) -> list[Tile]:
+    j = int(np.argmax(gap.before))
+    numbers = sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay")
+    late = [f for f in gap.findings if f.effect == "servo_delay"]
+    told = f"commands act {1e3 * late[0].values[0]:.2f} ms late" if late else "no delay of commands"
+    return [
+        Tile("Numbers found", str(numbers), told),
+        Tile("Tracking error", _arrow(gap.before[j], gap.after[j], "mrad"), f"joint {j + 1}, rms"),
+        Tile("At the hand", _arrow(gap.hand_before[-1], gap.hand_after[-1], "mm"), gap.hand),
+    ]
+
+
+def _found(gap: ServoGap) -> Table | None:
+    """Findings, a row for each joint and a column for each effect."""
+    heads, units, columns = ["Joint"], [""], []
+    for finding in gap.findings:
+        title, _, unit = EFFECTS[finding.effect]
+        factor, shown = shown_unit(finding.values[0], unit)
+        heads.append(capital(title))
+        units.append(shown)
+        cells = dict[int, str]()
+        rows = zip(finding.values, finding.std, finding.documented, strict=True)
+        for j, (value, std, documented) in zip(finding.joints, rows, strict=True):
+            known = "" if documented is None else f", not {plain(factor * documented, 3)}"
+            cells[j] = tied(f"{plus_minus(factor * value, factor * std)}{known}")
+        columns.append(cells)
+    if not columns:
+        return None
+    table = [
+        [f"{j} {name}", *(column.get(j, DASH) for column in columns)]
+        for j, name in enumerate(gap.joint_names, start=1)
+    ]
+    return Table(heads, table, units)
+
+
+def _errors(gap: ServoGap) -> Table:
+    hand = gap.hand_before, gap.hand_after
+    rows = [
+        [name, *(plain(1e3 * float(x[j]), 3) for x in (gap.before, gap.after, *hand))]
+        for j, name in enumerate(gap.joint_names)
+    ]
+    rows.append(["all", DASH, DASH, *(plain(1e3 * x[-1], 3) for x in hand)])
+    heads = ["Joint", "Before", "After", "Before", "After"]
+    return Table(heads, rows, ["", "mrad", "mrad", "hand, mm", "hand, mm"])
+
+
+def _arms(numbers: Sequence[ServoNumber]) -> Table | None:
+    """A row for each number, a column for each arm; those that differ stand out."""
+    arms = list(dict.fromkeys(arm for number in numbers for arm in number.values))
+    rows = [
+        [capital(x.title), *(tied(x.cell(arm)) + " ◄" * (arm in x.odd) for arm in arms)]
+        for x in numbers
+    ]
+    return Table(["Number", *arms], rows) if rows else None
+
+
+def _moments(gap: ServoGap) -> list[Panel]:
+    """The seconds in which the new servos are most off, of the joints that are most off."""
+    panels = []
+    for j in np.argsort(-gap.after)[:MOST_SHOWN].tolist():
+        each = []
+        for name, x in gap.curves:
+            start, stop = worst_window(x.t, left := x.after[:, j] - x.measured[:, j])
+            inside = (x.t >= start) & (x.t <= stop)
+            each.append((float(np.sum(left[inside] ** 2)), name, x, (start, stop)))
+        _, name, x, span = max(each, key=lambda one: one[0])
+        title = f"Joint {j + 1}, {gap.joint_names[j]}"
+        panels.append(rollout_drawing(x, j, *span).panel(title, "rad", f"of {name}"))
+    return panels
+
+
+def _unexplained(gap: ServoGap) -> list[int]:
+    """Joints (from 0) of which too much is left."""
+    far = (gap.after > SHARE * gap.before) & (1e3 * gap.after > CLOSE_MRAD)
+    return [int(j) for j in np.flatnonzero(far)]
+
+
+def _checks(gap: ServoGap) -> list[Check]:
+    far = gap.after > (1.0 + servo_words.WORSE) * gap.before
+    worse = [int(j) + 1 for j in np.flatnonzero(far)]
+    said = f"errors are of motions that the fit never saw ({gap.scored})"
+    lost = f"; {who('', worse)}: not better" if worse else ""
+    checks = [Check(LOOK if worse else GOOD, "On data not fitted", said + lost)]
+    left = [j + 1 for j in _unexplained(gap)]
+    if left:
+        said = f"{who('', left)}: more than a quarter of the error and {CLOSE_MRAD:g} mrad"
+        checks.append(
+            Check(LOOK, "What is left", f"{said} that no number of these servos explains")
+        )
+    else:
+        said = f"every joint is below a quarter of its error or below {CLOSE_MRAD:g} mrad"
+        checks.append(Check(GOOD, "What is left", said))
+    if gap.scale_open:
+        said = (
+            f"{who('', gap.scale_open)}: the documented masses hardly load it: motion is "
+            "foretold, but gains, friction and inertia are known but for a common factor"
+        )
+        checks.append(Check(LOOK, "Scale", said))
+    return checks
+
+
+def _steps(gap: ServoGap, model: str, servos: Path) -> list[Step]:
+    """What to measure next, and what the servos are for."""
+    steps = []
+    if "held out" not in gap.scored:
+        why = "Record another motion, best the one that counts, and let it judge"
+        steps.append(Step(why, command("gap", *gap.recordings, "--hold-out", "ANOTHER")))
+    if gap.ground.root > gap.servos.ground.root == 0.0:
+        steps.append(Step("Record a second motion that touches the table, or none that does"))
+    slow, fast = list[int](), list[int]()
+    for j in _unexplained(gap):
+        (slow if _share_slow(gap, j) > MOSTLY else fast).append(j + 1)
+    if slow:
+        why = "what is left is where it is slow: record slow ramps up and down, with stops"
+        steps.append(Step(f"{capital(who('', slow))}: {why}"))
+    if fast:
+        why = "what is left is where it is fast: record steps and quick motions of several sizes"
+        steps.append(Step(f"{capital(who('', fast))}: {why}"))
+    if gap.scale_open:
+        why = "move it with a known mass in the hand that the model has too"
+        steps.append(Step(f"{capital(who('', gap.scale_open))}: {why}"))
+    if not gap.servos.is_ideal:
+        why = "Use it: an arm for MuJoCo that follows commands as this one does"
+        words = "export", model, "--servo", str(servos), "--mjcf", "arm.xml"
+        steps.append(Step(why, command(*words)))
+        why = "See later what wears: only what has changed is named"
+        words = "gap", "LATER.mcap", "--model", model, "--servo", str(servos)
+        steps.append(Step(why, command(*words)))
+    return steps
+
+
+def _share_slow(gap: ServoGap, j: int) -> float:
+    """Of the squares that are left of a joint, the share at slow motion."""
+    slow, whole = 0.0, 0.0
+    for _, x in gap.curves:
+        squares = (x.after[:, j] - x.measured[:, j]) ** 2
+        still = np.abs(np.gradient(x.after[:, j], x.t)) < SLOW_RAD_S
+        slow, whole = slow + float(squares[still].sum()), whole + float(squares.sum())
+    return slow / max(whole, 1e-30)

@@ -1,0 +1,83 @@
+"""Torque limits, dead bands and backlash of position-controlled arms: are they named?
+
+    python tests/benchmarks/servo_limit_trials.py KIND [--seeds 12] [--first 0]
+
+KIND is limit, dead or backlash. Each seed is a simulated Panda of `servo_trials.py` with one such
+effect in two joints: a dead band of 2 to 10 mrad, backlash of 2 to 20 mrad, or a torque limit
+between what sines ask for in 60 % of time and the most that they ask for. Joints whose limit the
+motion does not reach, which its noise-free asked torque tells, are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.robots import read_robot
+from adapter.gap.servo import explain
+from tests.helpers.position_arm import Drawn, PositionArm, as_log, errors, named, position_arm
+
+EFFECTS = {"limit": "servo_torque_limit", "dead": "servo_dead_band", "backlash": "backlash"}
+
+
+def asked(arm: PositionArm, seed: int) -> np.ndarray:
+    """(m, n) N m, what both gains ask for on its sines; roughly, from the readings."""
+    moved, s, period = arm.moved("sines", seed), arm.servos, arm.drawn.period_s
+    fed = np.gradient(moved.q_command, period, axis=0) * s.feeds_speed
+    rate = fed - np.gradient(moved.q, period, axis=0)
+    return np.abs(s.kp * (moved.q_command - moved.q) + s.kd * rate)
+
+
+def drawn(kind: str, seed: int) -> tuple[PositionArm, list[int]]:
+    """An arm with the effect, and its joints (from 1)."""
+    rng = np.random.default_rng(9000 + seed)
+    period, noise = float(rng.choice([2e-3, 4e-3, 5e-3, 10e-3])), 10.0 ** rng.uniform(-5.0, -4.0)
+    arm = position_arm(seed, Drawn(20.0, period, float(noise), feeds_speed=seed % 2 == 0))
+    joints = rng.permutation(arm.truth.n)[:2]
+    if kind == "limit":
+        low, high = np.quantile(free := asked(arm, seed), 0.6, axis=0), free.max(axis=0)
+        sizes = low + rng.uniform(0.2, 0.8, arm.truth.n) * (high - low)
+    else:
+        most = {"dead": -2.0, "backlash": np.log10(0.02)}[kind]
+        sizes = 10.0 ** rng.uniform(np.log10(2e-3), most, arm.truth.n)
+    values = np.array(getattr(arm.servos, kind))
+    values[joints] = sizes[joints]
+    changed: dict[str, Any] = {kind: values}
+    return replace(arm, servos=replace(arm.servos, **changed)), (joints + 1).tolist()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kind", choices=tuple(EFFECTS))
+    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--first", type=int, default=0)
+    args = parser.parse_args()
+    panda, effect, rows = read_robot("panda"), EFFECTS[args.kind], []
+    for seed in range(args.first, args.first + args.seeds):
+        arm, joints = drawn(args.kind, seed)
+        if args.kind == "limit":
+            reached = (asked(arm, seed) > 1.02 * arm.servos.limit).mean(axis=0) > 0.01
+            joints = [j for j in joints if reached[j - 1]]
+        gap = explain([as_log(arm.moved("sines", seed))], panda)
+        told, off = named(gap), errors(gap, arm).get(effect, np.zeros(0))
+        of = next((f.joints for f in gap.findings if f.effect == effect), ())
+        close = sum(abs(x) < 0.1 for j, x in zip(of, off, strict=True) if j in joints)
+        right = len(told & {(effect, j) for j in joints})
+        wrong = sorted(told - arm.expected)
+        others = {(e, j) for e, j in arm.expected if e != effect}
+        rows.append((right, len(joints), close, len(wrong), len(told & others), len(others)))
+        print(
+            f"seed {seed}: {right} of {len(joints)}, within 10 % {close}, wrong {wrong}", flush=True
+        )
+    total = np.array(rows).sum(axis=0)
+    print(
+        f"{args.kind}: named {total[0]} of {total[1]}, within 10 % {total[2]}, wrong names "
+        f"{total[3]}; the servos' other numbers {total[4]} of {total[5]}"
+    )
+
+
+if __name__ == "__main__":
+    main()

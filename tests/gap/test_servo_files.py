@@ -1,0 +1,164 @@
+"""Servos in a robot's file: MuJoCo alone moves as our own simulation, and a user's file is kept."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from adapter import optional
+from adapter.cli import main
+from adapter.effects.robots import read_robot
+from adapter.errors import ModelError
+from adapter.gap.servo_files import servo_mjcf
+from adapter.gap.servo_kernels import Ground
+from adapter.gap.servo_model import ServoModel
+from adapter.gap.servo_signals import Track
+from adapter.model.mjcf_drives import SPEED
+from adapter.model.self_model import Limits
+from adapter.physics.rigid_arm import RigidArm
+from tests.helpers.position_arm import Drawn, as_log, position_arm
+from tests.helpers.position_mujoco import error_in_mujoco
+
+PANDA = read_robot("panda")
+FREE = replace(PANDA, limits=Limits.unknown(7))  # the simulated motors have no ends
+TABLE = 0.55, 2000.0  # m, N/m
+
+
+@pytest.mark.parametrize(
+    ("drawn", "table"),
+    [
+        (Drawn(noise_rad=5e-5), False),
+        (Drawn(feeds_speed=False, period_s=4e-3, noise_rad=5e-5), False),
+        (Drawn(noise_rad=1e-4, feeds_speed=False), True),
+    ],
+)
+def test_mujoco_alone_moves_as_our_simulation(drawn: Drawn, table: bool) -> None:
+    arm = position_arm(14, drawn)
+    servos = arm.documentation
+    if table:
+        arm = replace(arm, servos=replace(arm.servos, table=(0.0, 0.0, 0.12, *TABLE)))
+        point, up = np.array([0.0, 0.0, 0.12]), np.array([0.0, 0.0, 1.0])
+        servos = replace(servos, ground=Ground(6, point, up, TABLE[0], TABLE[1] ** 0.5))
+    log = as_log(arm.moved("points", 64))
+    track = Track.of(log)
+    own = servos.tracking_error(track, RigidArm.of(PANDA))
+    there = error_in_mujoco(servo_mjcf(FREE, servos).text, log, track.start)
+    assert np.all(there < 1.2 * own), there / own
+    if table:  # which the arm truly touched
+        air = replace(servos, ground=servos.ground._replace(root=0.0))
+        assert air.tracking_error(track, RigidArm.of(PANDA)).max() > 20.0 * own.max()
+
+
+DRESSED = """<mujoco model="dressed">
+  <default><position dampratio="1" kp="5"/><default class="small"><joint damping="3"/></default>
+  </default>
+  <compiler angle="radian"/><option timestep="0.002"/>
+  <worldbody><!-- a table -->
+    <geom name="ground" type="plane" size="1 1 1"/>
+    <body name="low" pos="0 0 1"><inertial pos="0 0 .1" mass="1" diaginertia="1e-2 1e-2 1e-2"/>
+      <joint name="a" class="small" axis="0 1 0" range="-2 2"/>
+      <body name="high" pos="0 0 .3"><inertial pos="0 0 .1" mass="1" diaginertia="1e-2 1e-2 1e-2"/>
+        <joint name="b" axis="1 0 0" pos="0 0 .01" range="-1 1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="lifts" joint="b" ctrlrange="-9 9" forcerange="-4 4"/>
+    <position joint="a" kp="900"/>
+    <velocity name="brakes" joint="a" kv="2"/>
+  </actuator>
+  <keyframe><key name="home" qpos="0 0" ctrl="0.5 0.25 0"/></keyframe>
+</mujoco>
+"""
+SERVO = """delay_s = 0.004
+[[joint]]
+name = "a"
+position_gain = 20.0
+velocity_gain = 0.7
+viscous = 0.2
+feeds_speed = true
+[[joint]]
+name = "b"
+position_gain = 30.0
+velocity_gain = 0.9
+coulomb = 0.1
+armature = 0.02
+[ground]
+joint = "b"
+point = [0.0, 0.0, 0.2]
+up = [0.0, 0.0, 1.0]
+height = -0.5
+stiffness = 300.0
+"""
+
+
+@pytest.fixture
+def dressed(tmp_path: Path) -> Path:
+    (tmp_path / "arm.xml").write_text(DRESSED)
+    (tmp_path / "servo.toml").write_text(SERVO)
+    return tmp_path
+
+
+def test_a_users_file_gets_its_servos_and_keeps_the_rest(dressed: Path, capsys) -> None:
+    words = ["export", str(dressed / "arm.xml"), "--servo", str(dressed / "servo.toml")]
+    out, figures = dressed / "out.xml", dressed / "said.json"
+    assert main([*words, "--mjcf", str(out), "--json", str(figures)]) == 0
+    assert "rad/s, to the actuators JOINT_speed" in capsys.readouterr().err
+    assert json.loads(figures.read_text())["onto"] == str(dressed / "arm.xml")
+    m = mujoco.MjModel.from_xml_path(str(out))
+    names = [m.actuator(k).name for k in range(m.nu)]
+    assert names == ["lifts", "a", "a" + SPEED]
+    lifts, a, speed = (m.actuator(name) for name in names)
+    assert np.array_equal(lifts.biasprm[:3], [0.0, -30.0, -0.9]) and lifts.gainprm[0] == 30.0
+    assert lifts.ctrlrange.tolist() == [-1.0, 1.0] and lifts.forcerange.tolist() == [-4.0, 4.0]
+    assert np.array_equal(a.biasprm[:3], [0.0, -20.0, 0.0]) and speed.gainprm[0] == 0.7
+    assert m.actuator_delay.tolist() == [0.005] * 3  # half a step of 2 ms more
+    joints = [m.joint(name) for name in "ab"]
+    assert [float(x.damping[0]) for x in joints] == [0.2, 0.0]
+    assert [float(x.frictionloss[0]) for x in joints] == [0.0, 0.1]
+    assert [float(x.armature[0]) for x in joints] == [0.0, 0.02]
+    assert m.opt.timestep == 0.002 and m.geom("ground").contype[0] == 1
+    assert m.key("home").qpos.tolist() == [0.0, 0.0]
+    assert "<!-- a table -->" in out.read_text()
+
+
+def test_the_ground_pushes_as_a_spring(dressed: Path) -> None:
+    """At rest on it, depth times stiffness carries what the servos do not."""
+    servo = SERVO.replace("delay_s = 0.004", "").replace("height = -0.5", "height = 0.9")
+    (dressed / "servo.toml").write_text(servo)
+    words = ["export", str(dressed / "arm.xml"), "--servo", str(dressed / "servo.toml")]
+    assert main([*words, "--mjcf", str(dressed / "out.xml")]) == 0
+    m = mujoco.MjModel.from_xml_path(str(dressed / "out.xml"))
+    d = mujoco.MjData(m)
+    d.qpos[0] = d.ctrl[1] = 1.6
+    for _ in range(5000):
+        mujoco.mj_step(m, d)
+    assert d.ncon == 1 and np.abs(d.qvel).max() < 1e-9
+    depth = 0.9 - d.geom_xpos[m.geom("touches_found_ground").id][2]
+    push = float(d.efc_force[d.contact[0].efc_address])
+    assert push > 1.0 and abs(push / (300.0 * depth) - 1.0) < 1e-6
+
+
+def test_what_cannot_be_written_is_said(dressed: Path, monkeypatch, capsys) -> None:
+    with pytest.raises(ModelError, match="where their commands are"):
+        servo_mjcf(FREE, ServoModel.ideal(FREE.tree.joint_names))
+    old = SimpleNamespace(MjModel=SimpleNamespace())
+    monkeypatch.setattr(optional, "load", lambda name: old)
+    late = replace(position_arm(1).documentation, delay_s=0.003)
+    written = servo_mjcf(FREE, late)
+    assert "delay=" not in written.text
+    assert "give commands 3.00 ms late" in " ".join(written.notes)
+    assert 'timestep="0.0005" integrator="RK4"' in written.text
+    quick = replace(late, viscous=1e4 * late.viscous)  # too quick for Runge and Kutta
+    assert 'timestep="0.0001" integrator="implicitfast"' in servo_mjcf(FREE, quick).text
+    monkeypatch.undo()
+    (dressed / "scene.xml").write_text('<mujoco><include file="arm.xml"/></mujoco>')
+    words = ["export", str(dressed / "scene.xml"), "--servo", str(dressed / "servo.toml")]
+    assert main([*words, "--mjcf", str(dressed / "x.xml")]) == 2
+    assert "does not stand in this file" in capsys.readouterr().err
