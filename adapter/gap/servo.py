@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -44,6 +43,7 @@ from adapter.gap.servo_kernels import (
     Load,
 )
 from adapter.gap.servo_model import ServoModel
+from adapter.gap.servo_result import DOCUMENTED_SHARE, SURE, Findings, ServoGap, rms
 from adapter.gap.servo_signals import Track, loads, over_ground
 from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
@@ -55,15 +55,11 @@ from adapter.screening.timing import unwrapped
 from drivers.files.mcap import Log
 
 ROUNDS = 2  # in which the load follows from the arm's simulated motion
-SURE = 4.0  # standard deviations from the documented value, from which on it is another one
-DOCUMENTED_SHARE = 0.01  # of a documented value, to which it is meant; one standard deviation
 LEAST_DELAY_S = 1e-5  # standard deviation of one joint's, at least
 DOCUMENTED_DELAY_S = 5e-5  # the same of a delay
-SHOWN = 2.0  # from zero, where nobody documented a value: every servo has some of it
 TIE_CHI2 = 4.0  # by which an effect must foretell blocks that its fit has not seen better
 FITTED_SHARE = 2.0 / 3.0  # of a recording, where none is held out
 DRAWS = 8  # of inertias as wrong as the documentation may be
-OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
 HAND_ROWS = 500  # of a recording, where the way of the hand is told
@@ -73,92 +69,21 @@ ROUGH_STEP_S = 8e-3  # of the first simulations
 LIMITED_CHI2, LIMITED_SHARE = 12.0, 0.25
 TOUCHED_S, LEAST_TOUCHED = 1.0, 2  # for so long, in so many recordings: its place is known
 
-EFFECTS = {  # what each is called, its parameter and its unit
-    "servo_position_gain": ("position gain", "kp", "N m/rad"),
-    "servo_velocity_gain": ("velocity gain", "kd", "N m s/rad"),
-    "servo_delay": ("delay of commands", "d", "s"),
-    "coulomb_friction": ("Coulomb friction", "Fc", "N m"),
-    "viscous_friction": ("viscous friction", "Fv", "N m s/rad"),
-    "motor_inertia": ("motor inertia (armature)", "B", "kg m2"),
-    "servo_torque_limit": ("torque limit", "tau_max", "N m"),
-    "servo_dead_band": ("dead band", "e0", "rad"),
-    "backlash": ("backlash", "b", "rad"),
-}
-DAMPS = ("servo_velocity_gain", "viscous_friction")
-WITH_FRICTION = "velocity gain and viscous friction together: no command's speed tells them apart"
-
-
-@dataclass(frozen=True)
-class ServoFinding:
-    """One effect on some joints, whose number is not the documented one.
-
-    Attributes:
-        effect: one of `EFFECTS`; joints: from 1.
-        values, std, documented: one for each joint, SI; documented is None where nobody says.
-        open: what cannot be told apart from it; empty where it stands alone.
-    """
-
-    effect: str
-    joints: tuple[int, ...]
-    values: tuple[float, ...]
-    std: tuple[float, ...]
-    documented: tuple[float | None, ...]
-    open: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class ServoGap:
-    """All that is said of a position-controlled arm.
-
-    Attributes:
-        joint_names, model_name, recordings: of the arm, its model and the files.
-        findings: by effect; servos: the new model.
-        curves: what the fit has not seen, recordings held out or the last third, by name: measured,
-            and foretold by commands alone, before by the documented and after by the new servos.
-        scored: which data these are, in words.
-        hand: the frame at the hand; hand_before, hand_after: (n + 1,) m, rms by which it is off, by
-            each joint's error alone and, last, by all of them.
-        scale_open: joints (from 1) whose documented masses do not show the gains' scale.
-        ground: what the hand came down on beside what is documented, if anything; touched: for how
-            long, s, in each recording that is fitted.
-        notes: a sentence each.
-    """
-
-    joint_names: tuple[str, ...]
-    model_name: str
-    recordings: tuple[str, ...]
-    findings: tuple[ServoFinding, ...]
-    servos: ServoModel
-    curves: tuple[tuple[str, RolloutCurves], ...]
-    scored: str
-    hand: str
-    hand_before: Array
-    hand_after: Array
-    scale_open: tuple[int, ...] = ()
-    ground: Ground = NO_GROUND
-    touched: tuple[float, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @cached_property
-    def before(self) -> Array:
-        """(n,) rad, rms tracking error of the documented servos, all recordings counting alike."""
-        return _rms([x.before - x.measured for _, x in self.curves])
-
-    @cached_property
-    def after(self) -> Array:
-        """(n,) rad, the same of the new servos."""
-        return _rms([x.after - x.measured for _, x in self.curves])
-
 
 @dataclass(frozen=True, eq=False)
 class _Arm:
-    """What every station needs: the documented arm and servos, recordings, inertias drawn."""
+    """What every station needs: the documented arm and servos, recordings, inertias drawn.
+
+    Attributes:
+        usual: rad/(N m), one over the median of its position gains; 0 where it is not known.
+    """
 
     rigid: RigidArm
     documented: ServoModel
     tracks: tuple[Track, ...]
     inertia_prior: float
     ground: Ground = NO_GROUND
+    usual: float = 0.0
 
     def fixed(self, j: int) -> Array:
         """(10,) documented parameters of a joint, as `Freedom` takes them."""
@@ -180,7 +105,9 @@ class _Arm:
         each = [loads(self.rigid, motion, self.ground) for motion in motions]
         rows = [track.judged for track in self.tracks]
         n = self.rigid.n
-        return [JointTask(j, self.tracks, [own[j] for own in each], rows) for j in range(n)]
+        return [
+            JointTask(j, self.tracks, [own[j] for own in each], rows, self.usual) for j in range(n)
+        ]
 
     def drawn_loads(self, motions: Sequence[Array]) -> list[list[list[Load]]]:
         """Loads by draw, recording and joint of arms whose inertias are as wrong as they may be."""
@@ -241,7 +168,7 @@ def explain(
     if hand.parent == hand.name:  # nothing rides on the last link, which may be a jaw
         hand = next((x for x in model.frames[::-1] if x.parent in model.tree.link_names), hand)
     place = arm.rigid, model.tree.link_names.index(hand.parent), hand.position
-    found = _Table(arm)
+    found = Findings(documented)
     for j, fit in enumerate(fits):
         found.add_joint(j, fit)
     for j, fit in enumerate(fits):
@@ -314,8 +241,10 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
         ground, x = find_ground(arm.rigid, tasks, x)
         arm = replace(arm, ground=ground)
         tasks = replace(arm, tracks=tracks).tasks(motions)
+    if arm.documented.is_ideal:
+        arm = replace(arm, usual=float(np.median(x[:, A])))
     fits = [
-        _limited(JointFit(task, fit.freedom, own), noise[j])
+        _limited(JointFit(replace(task, usual=arm.usual), fit.freedom, own), noise[j])
         for j, (task, fit, own) in enumerate(zip(tasks, fits, x, strict=True))
     ]
     tasks = arm.tasks([track.smooth for track in arm.tracks])
@@ -339,11 +268,19 @@ def _limited(fit: JointFit, noise: float) -> JointFit:
             start = min(starts, key=lambda x: misfit(fit.task.fitted(x)))
             fits.append(fit_joint(fit.task, freedom, start))
         best = min(fits, key=JointFit.error, default=fit)
-        least = max(LIMITED_CHI2 * best.unit, LIMITED_SHARE * fit.error())
-        if fit.error() - best.error() < least or _paid(best, fit) < LIMITED_CHI2:
+        if not _explains(best, fit):
             break
-        fit = best
+        earlier, fit = np.flatnonzero(fit.freedom.free[:WITHIN]), best
+        for k in earlier[earlier > DELAY]:  # what stood in for what is there now
+            without = fit_joint(fit.task, fit.freedom.without(k), fit.x)
+            fit = fit if _explains(fit, without) else without
     return fit
+
+
+def _explains(fit: JointFit, without: JointFit) -> bool:
+    """Whether what a fit has and another has not explains enough of what that one leaves."""
+    least = max(LIMITED_CHI2 * fit.unit, LIMITED_SHARE * without.error())
+    return without.error() - fit.error() > least and _paid(fit, without) > LIMITED_CHI2
 
 
 def _motions(arm: _Arm, fits: Sequence[JointFit]) -> list[Array]:
@@ -539,11 +476,6 @@ def _scored(
     return tuple(found), told
 
 
-def _rms(left: Sequence[Array]) -> Array:
-    """Root mean square over the rows of tables that count alike."""
-    return np.asarray(np.sqrt(np.mean([np.mean(x**2, axis=0) for x in left], axis=0)))
-
-
 def _hand_off(
     arm: RigidArm, link: int, point: Array, pairs: Sequence[tuple[Array, Array]]
 ) -> Array:
@@ -563,75 +495,4 @@ def _hand_off(
             here = at(one[k])
             ways.append([np.linalg.norm(at(q) - here) for q in moved])
         left.append(np.array(ways))
-    return _rms(left)
-
-
-class _Table:
-    """Findings as they come, joint by joint."""
-
-    def __init__(self, arm: _Arm) -> None:
-        self.docs = arm.documented
-        self.rows: dict[str, list[tuple[int, float, float, float | None]]] = {
-            e: [] for e in EFFECTS
-        }
-        self.together = False
-        self.scale_open: list[int] = []
-        self.notes: list[str] = []
-
-    def add(self, effect: str, j: int, value: float, std: float, documented: float) -> None:
-        """A value of joint j (from 0), where it is another one than documented."""
-        told = bool(np.isfinite(self.docs.position_gain[j]) and np.isfinite(documented))
-        far = abs(value - documented) if told else value
-        meant = DOCUMENTED_SHARE * max(documented, self.docs.velocity_gain[j] * (effect in DAMPS))
-        if far > (SURE * np.hypot(std, meant) if told else SHOWN * std):
-            row = j + 1, float(value), float(std), float(documented) if told else None
-            self.rows[effect].append(row)
-        else:
-            title, _, unit = EFFECTS[effect]
-            self.notes.append(
-                f"joint {j + 1}: {title} of {value:.3g} {unit} is in the model and not named: "
-                "inertias as wrong as they may be explain as much"
-            )
-
-    def add_joint(self, j: int, fit: JointFit) -> None:
-        """What a joint's fit found."""
-        docs, free = self.docs, fit.freedom.free
-        values, std = fit.values, np.sqrt(np.diagonal(fit.doubt))
-        gain = float(docs.velocity_gain[j])
-        if free[A]:
-            self.add("servo_position_gain", j, values[0], std[0], float(docs.position_gain[j]))
-            if std[0] > OPEN_SHARE * values[0]:
-                self.scale_open.append(j + 1)
-        if free[LEAD]:
-            self.add("servo_velocity_gain", j, values[1], std[1], gain)
-        if fit.x[LEAD] > 0.0 and (free[LEAD] or free[DAMPING]):
-            apart = np.eye(WITHIN)[DAMPING] - np.eye(WITHIN)[LEAD]
-            doubt = float(np.sqrt(apart @ fit.doubt @ apart))
-            self.add("viscous_friction", j, float(apart @ values), doubt, float(docs.viscous[j]))
-        elif free[DAMPING] and gain > 0.0:
-            self.add("viscous_friction", j, values[2] - gain, std[2], float(docs.viscous[j]))
-        elif free[DAMPING]:
-            self.together = True
-            self.add("servo_velocity_gain", j, values[2], std[2], gain)
-        if free[INERTIA]:
-            self.add("motor_inertia", j, values[3], std[3], float(docs.armature[j]))
-        if free[RUBS]:
-            self.add("coulomb_friction", j, values[4], std[4], float(docs.coulomb[j]))
-        if free[TIGHT] and values[TIGHT] > 0.0:
-            limit, off = 1.0 / values[TIGHT], std[TIGHT] / values[TIGHT] ** 2
-            self.add("servo_torque_limit", j, limit, off, float(docs.torque_limit[j]))
-        if free[DEAD]:
-            self.add("servo_dead_band", j, values[DEAD], std[DEAD], float(docs.dead_band[j]))
-        if free[PLAY]:
-            self.add("backlash", j, 2 * values[PLAY], 2 * std[PLAY], float(docs.backlash[j]))
-
-    def findings(self) -> tuple[ServoFinding, ...]:
-        """By effect."""
-        found = []
-        for effect, entries in self.rows.items():
-            if entries:
-                joints, values, stds, documented = zip(*entries, strict=True)
-                both = self.together and effect == "servo_velocity_gain"
-                said = WITH_FRICTION if both else ""
-                found.append(ServoFinding(effect, joints, values, stds, documented, said))
-        return tuple(found)
+    return rms(left)

@@ -12,7 +12,7 @@ import numpy as np
 
 from adapter.errors import UsageError
 from adapter.gap.phrases import shown_unit
-from adapter.gap.servo import EFFECTS, SURE
+from adapter.gap.servo_result import EFFECTS, SURE
 from adapter.model.numbers import DASH, plain, plus_minus
 
 LEAST_SHARE = 0.1  # of a number, to which those of simulated arms are known whatever they move

@@ -54,12 +54,15 @@ class JointTask:
     Attributes:
         joint: from 0; tracks: the recordings; loads: of the joint on each.
         rows: for each track the (k,) readings that are fitted.
+        usual: rad/(N m), one over the position gain that such servos have; 0 where not known. It
+            tells the scale where the documented masses hardly load the joint.
     """
 
     joint: int
     tracks: Sequence[Track]
     loads: Sequence[Load]
     rows: Sequence[NDArray[np.bool_]]
+    usual: float = 0.0
 
     def left(self, x: Array) -> list[Array]:
         """What (10,) parameters leave of each recording's readings (k,), rad."""
@@ -211,11 +214,17 @@ def fit_joint(task: JointTask, freedom: Freedom, start: Array) -> JointFit:
     if not freedom.free.any():
         return JointFit(task, freedom, freedom.full(x[freedom.free]))
 
+    prior = task.usual > 0.0 and x[A] > 0.0 and bool(freedom.free[A])
+    held = MILLI * np.sqrt(chi2_unit(task, x)) / np.log(ALIKE) if prior else 0.0
+
     def left(z: Array) -> Array:
-        return task.fitted(freedom.full(z * scale)) * MILLI
+        own = freedom.full(z * scale)
+        rows = task.fitted(own) * MILLI
+        return np.append(rows, held * np.log(own[A] / task.usual)) if prior else rows
 
     def slopes(z: Array) -> Array:
-        return _slopes(task, freedom, z * scale, scale) * MILLI
+        rows = _slopes(task, freedom, z * scale, scale) * MILLI
+        return np.vstack([rows, (np.arange(len(z)) == 0) * held / z[0]]) if prior else rows
 
     low, high = np.zeros(PARAMETERS), np.full(PARAMETERS, np.inf)
     if x[A] > 0.0:  # what the masses hardly load tells no gain

@@ -8,8 +8,8 @@ import numpy as np
 from rich.markup import escape
 
 from adapter.gap.phrases import listed, numbered, shown_unit
-from adapter.gap.servo import EFFECTS, ServoFinding, ServoGap
 from adapter.gap.servo_model import ground_facts
+from adapter.gap.servo_result import EFFECTS, ServoFinding, ServoGap
 from adapter.model.numbers import plain, plus_minus
 
 WORSE = 0.05  # share by which an error of a joint may grow, and unsaid

@@ -9,8 +9,8 @@ import numpy as np
 
 from adapter.gap import servo_words
 from adapter.gap.phrases import shown_unit, who
-from adapter.gap.servo import EFFECTS, ServoGap
 from adapter.gap.servo_arms import ServoNumber
+from adapter.gap.servo_result import EFFECTS, ServoGap
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.report.gap_panels import fall_drawing, rollout_drawing, worst_window
 from adapter.report.gap_tables import tied

@@ -11,8 +11,8 @@ import pytest
 
 from adapter.cli import main
 from adapter.errors import UsageError
-from adapter.gap.servo import EFFECTS
 from adapter.gap.servo_arms import beside
+from adapter.gap.servo_result import EFFECTS
 from tests.helpers.position_arm import Drawn, position_arm
 
 JOINTS = ["a", "b", "c"]

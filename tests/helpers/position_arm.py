@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.gap.servo import EFFECTS, ServoGap
 from adapter.gap.servo_model import ServoModel
+from adapter.gap.servo_result import EFFECTS, ServoGap
 from drivers.files.mcap import Commands, Log, McapWriter
 from sim.dynamics import Frames, compiled, end_effector, mass_matrix, torques
 from sim.hidden.motion import draw_motion
