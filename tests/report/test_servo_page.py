@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adapter.gap.result import RolloutCurves
-from adapter.gap.servo import WITH_FRICTION, ServoFinding, ServoGap
+from adapter.gap.servo_result import WITH_FRICTION, ServoFinding, ServoGap
 from adapter.gap.servo_kernels import Ground
 from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_words import as_json, lines
