@@ -307,6 +307,7 @@ def test_states_of_strangers_are_refused(peer5, connected):
     assert arm.intake.refused == {"stranger": 1}
 
 
+@pytest.mark.alone  # a peer that stands still for a second is a dead robot
 def test_a_loop_that_was_away_gets_fresh_states_and_an_exact_account(peer5, connected):
     arm = connected(peer5)
     first = quiet(arm, peer5)
@@ -356,6 +357,7 @@ def test_a_killed_reader_is_replaced(peer5, connected):
     assert sum("was replaced" in note for note in arm.intake.notes) == 1
 
 
+@pytest.mark.alone  # a spare that the machine has no time for is none
 @pytest.mark.parametrize("ready", [True, False])
 def test_a_spare_reader_takes_over_in_motion(in_motion, ready):
     """The motion goes on where the spare had started; where it dies as well, a new one is made."""

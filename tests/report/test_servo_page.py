@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from adapter.gap.result import RolloutCurves
-from adapter.gap.servo_result import WITH_FRICTION, ServoFinding, ServoGap
 from adapter.gap.servo_kernels import Ground
 from adapter.gap.servo_model import ServoModel
+from adapter.gap.servo_result import WITH_FRICTION, ServoFinding, ServoGap
 from adapter.gap.servo_words import as_json, lines
 from adapter.report.servo_page import render_servo_page
 from tests.helpers.browser import ids_of_a_whole_page, laid_out, text_of
