@@ -59,7 +59,8 @@ def main() -> None:
     for seed in range(args.first, args.first + args.seeds):
         arm, joints = drawn(args.kind, seed)
         if args.kind == "limit":
-            reached = (asked(arm, seed) > 1.02 * arm.servos.limit).mean(axis=0) > 0.01
+            quiet = replace(arm, servos=replace(arm.servos, noise_rad=0.0))
+            reached = (asked(quiet, seed) > 1.02 * arm.servos.limit).mean(axis=0) > 0.01
             joints = [j for j in joints if reached[j - 1]]
         gap = explain([as_log(arm.moved("sines", seed))], panda)
         told, off = named(gap), errors(gap, arm).get(effect, np.zeros(0))
