@@ -141,8 +141,7 @@ def explain(
     names = model.tree.joint_names
     logs, hold_out = ([going_on(log, model) for log in x] for x in (logs, hold_out))
     documented = documented or ServoModel.ideal(names)
-    tracks = tuple(_track(log, names) for log in logs)
-    unseen = tuple(_track(log, names) for log in hold_out)
+    tracks, unseen = (tuple(map(_track, x)) for x in (logs, hold_out))
     arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior, documented.ground)
     progress("fitting each joint's servo")
     # of an encoder's reading, by its third differences
@@ -154,7 +153,7 @@ def explain(
         fits: list[JointFit] = []
         servos = documented
     else:
-        arm, fits = _rough(arm, [log.select(names) for log in logs], noise)
+        arm, fits = _rough(arm, logs, noise)
         fits = _named(arm, fits, progress)
         servos = _servos(arm, fits)
     down = [over_ground(arm.rigid, arm.ground, track.smooth[0])[1] < 0.0 for track in tracks]
@@ -193,7 +192,7 @@ def explain(
 
 
 def going_on(log: Log, model: SelfModel) -> Log:
-    """A recording with positions and commands of joints that were told within one turn going on."""
+    """A recording of the model's joints alone, those told within one turn going on beyond it."""
     log, own = log.select(model.tree.joint_names), model.limits
     q, _ = unwrapped(log.q, own.lower, own.upper)
     if log.commands is None or log.commands.q is None or not len(log.commands.q):
@@ -204,8 +203,7 @@ def going_on(log: Log, model: SelfModel) -> Log:
     return replace(log, q=q, commands=replace(log.commands, q=goal - 2.0 * np.pi * turns))
 
 
-def _track(log: Log, names: tuple[str, ...]) -> Track:
-    log = log.select(names)
+def _track(log: Log) -> Track:
     span = 1e-9 * float(np.ptp(log.stamp_ns)) if len(log.stamp_ns) else 0.0
     orders = 0 if log.commands is None else len(log.commands.stamp_ns)
     if span < SHORTEST_S or orders < 2:

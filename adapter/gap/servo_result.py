@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from adapter.gap.result import RolloutCurves
+from adapter.gap.result import WORSE, RolloutCurves
 from adapter.gap.servo_fit import JointFit
 from adapter.gap.servo_kernels import (
     DAMPING,
@@ -106,6 +106,11 @@ class ServoGap:
     def after(self) -> Array:
         """(n,) rad, the same of the new servos."""
         return rms([x.after - x.measured for _, x in self.curves])
+
+    @property
+    def worse(self) -> list[int]:
+        """Joints (from 1) that the new servos foretell worse than the documented ones."""
+        return [int(j) + 1 for j in np.flatnonzero(self.after > (1.0 + WORSE) * self.before)]
 
 
 def rms(left: Sequence[Array]) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from rich.markup import escape
 
 from adapter.gap.phrases import listed, numbered, shown_unit
@@ -12,7 +11,6 @@ from adapter.gap.servo_model import ground_facts
 from adapter.gap.servo_result import EFFECTS, ServoFinding, ServoGap
 from adapter.model.numbers import plain, plus_minus
 
-WORSE = 0.05  # share by which an error of a joint may grow, and unsaid
 LABEL = 31  # columns of a figure's name
 
 
@@ -28,8 +26,7 @@ def headline(gap: ServoGap) -> str:
     said = (
         f"tracking error of the worst joint {before} -> {after}, at the hand {hand} ({gap.scored})"
     )
-    worse = np.flatnonzero(gap.after > (1.0 + WORSE) * gap.before) + 1
-    left = [f"joint {numbered(worse.tolist())}: not better"] if worse.size else []
+    left = [f"joint {numbered(gap.worse)}: not better"] if gap.worse else []
     return "; ".join([*parts, said, *left])
 
 

@@ -159,11 +159,9 @@ def _unexplained(gap: ServoGap) -> list[int]:
 
 
 def _checks(gap: ServoGap) -> list[Check]:
-    far = gap.after > (1.0 + servo_words.WORSE) * gap.before
-    worse = [int(j) + 1 for j in np.flatnonzero(far)]
     said = f"errors are of motions that the fit never saw ({gap.scored})"
-    lost = f"; {who('', worse)}: not better" if worse else ""
-    checks = [Check(LOOK if worse else GOOD, "On data not fitted", said + lost)]
+    lost = f"; {who('', gap.worse)}: not better" if gap.worse else ""
+    checks = [Check(LOOK if gap.worse else GOOD, "On data not fitted", said + lost)]
     left = [j + 1 for j in _unexplained(gap)]
     if left:
         said = f"{who('', left)}: more than a quarter of the error and {CLOSE_MRAD:g} mrad"
@@ -207,7 +205,7 @@ def _steps(gap: ServoGap, model: str, servos: Path) -> list[Step]:
         words = "export", model, "--servo", str(servos), "--mjcf", "arm.xml"
         steps.append(Step(why, command(*words)))
         why = "See later what wears: only what has changed is named"
-        words = "gap", "LATER.mcap", "--model", model, "--servo", str(servos)
+        words = "gap", "LATER.mcap", "--robot", model, "--servo", str(servos)
         steps.append(Step(why, command(*words)))
     return steps
 

@@ -69,7 +69,7 @@ def test_a_servo_of_another_batch_is_found_by_the_command(tmp_path: Path, capsys
         if k == 2:
             arm.servos.coulomb[2] *= 1.5
         arm.moved("sines", 61 + k).write(tmp_path / f"{k}.mcap")
-        words = ["gap", str(tmp_path / f"{k}.mcap"), "--model", "panda", "--quiet"]
+        words = ["gap", str(tmp_path / f"{k}.mcap"), "--robot", "panda", "--quiet"]
         words += ["--out", str(tmp_path / f"arm_{k}")]
         if k == 2:
             capsys.readouterr()
