@@ -151,7 +151,9 @@ class _Writer:
             facts |= {key: x for key, x in ranges.items() if np.isfinite(x).all()}
             old = [x for x in there if x.attributes.get("joint") == name]
             if old:
-                self.xml.replace(old[0], _element("position", facts | self._kept(old[0]) | late))
+                kept = self._kept(old[0])  # but for a limit that was found
+                facts = kept | facts | {"name": kept.get("name", name)}
+                self.xml.replace(old[0], _element("position", facts | late))
             else:
                 new.append(_element("position", facts | late))
                 steered.append(name)

@@ -128,6 +128,17 @@ def test_a_users_file_gets_its_servos_and_keeps_the_rest(dressed: Path, capsys) 
     assert "<!-- a table -->" in out.read_text()
 
 
+def test_a_limit_that_was_found_goes_before_the_files(dressed: Path, capsys) -> None:
+    limited = SERVO.replace("armature = 0.02", "torque_limit = 3.0\ndead_band = 0.002")
+    (dressed / "servo.toml").write_text(limited)
+    out = dressed / "out.xml"
+    words = ["export", str(dressed / "arm.xml"), "--servo", str(dressed / "servo.toml")]
+    assert main([*words, "--mjcf", str(out)]) == 0
+    assert "the dead band of joint 2 is not in it" in capsys.readouterr().err
+    lifts = mujoco.MjModel.from_xml_path(str(out)).actuator("lifts")
+    assert lifts.forcerange.tolist() == [-3.0, 3.0]
+
+
 def test_the_ground_pushes_as_a_spring(dressed: Path) -> None:
     """At rest on it, depth times stiffness carries what the servos do not."""
     servo = SERVO.replace("delay_s = 0.004", "").replace("height = -0.5", "height = 0.9")
