@@ -18,6 +18,7 @@ LOAD_KG = 4.0  # one standard deviation
 MASSES_KG = (0.5, 1.5, 4.5)  # that are tried: how far off a load's moments may be grows with it
 BEYOND_M, REACH_M = 0.08, 0.08  # of a load's centre from the face, and how far it may be elsewhere
 UNKNOWN_REACH_M = 0.12  # where nobody says which way the hand points
+FACES = ("tool0", "flange", "link8")  # how names of frames end that a tool is bolted to
 CLOSE_M = 0.01  # a face so near to the last link's centre does not say it either
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adapter.gap.hand import hand_frame
+from adapter.gap.hand import FACES, hand_frame
 from adapter.gap.result import RolloutCurves
 from adapter.gap.servo_fit import (
     ALL_FREE,
@@ -26,7 +26,7 @@ from adapter.gap.servo_fit import (
     guesses,
     misfit,
 )
-from adapter.gap.servo_ground import LEAST_JOINTS, find_ground
+from adapter.gap.servo_ground import LEAST_JOINTS, Tip, find_ground
 from adapter.gap.servo_kernels import (
     DAMPING,
     DEAD,
@@ -67,7 +67,8 @@ ROUGH_STEP_S = 8e-3  # of the first simulations
 # what a limit, a dead band or backlash has to tell of blocks not seen, and its share of what was
 # left: simulated ones explain nearly all of it, on a real arm a wrong one explained a tenth
 LIMITED_CHI2, LIMITED_SHARE = 12.0, 0.25
-TOUCHED_S, LEAST_TOUCHED = 1.0, 2  # for so long, in so many recordings: its place is known
+# for so long, in so many recordings (one, where the hand's tip is documented): its place is known
+TOUCHED_S, LEAST_TOUCHED = 1.0, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,7 @@ class _Arm:
 
     Attributes:
         usual: rad/(N m), one over the median of its position gains; 0 where it is not known.
+        tips: of the hand, as documented: where nobody can bolt a tool on.
     """
 
     rigid: RigidArm
@@ -84,6 +86,7 @@ class _Arm:
     inertia_prior: float
     ground: Ground = NO_GROUND
     usual: float = 0.0
+    tips: tuple[Tip, ...] = ()
 
     def fixed(self, j: int) -> Array:
         """(10,) documented parameters of a joint, as `Freedom` takes them."""
@@ -142,7 +145,13 @@ def explain(
     logs, hold_out = ([going_on(log, model) for log in x] for x in (logs, hold_out))
     documented = documented or ServoModel.ideal(names)
     tracks, unseen = (tuple(map(_track, x)) for x in (logs, hold_out))
-    arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior, documented.ground)
+    links = model.tree.link_names
+    tips = tuple(
+        (links.index(x.parent), x.position)
+        for x in model.frames
+        if x.parent in links[-2:] and not x.name.endswith(FACES)
+    )
+    arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior, documented.ground, tips=tips)
     progress("fitting each joint's servo")
     # of an encoder's reading, by its third differences
     noise = np.max(
@@ -159,7 +168,8 @@ def explain(
     down = [over_ground(arm.rigid, arm.ground, track.smooth[0])[1] < 0.0 for track in tracks]
     touched = tuple(float(x.sum() * t.step_s) for x, t in zip(down, tracks, strict=True))
     ground = NO_GROUND if arm.ground is documented.ground else arm.ground
-    if ground.root > 0.0 and sum(x > TOUCHED_S for x in touched) < LEAST_TOUCHED:
+    least = LEAST_TOUCHED if not tips else 1
+    if ground.root > 0.0 and sum(x > TOUCHED_S for x in touched) < least:
         servos = replace(servos, ground=NO_GROUND)  # one motion does not tell it in other poses
     progress("foretelling what was held out")
     curves, scored = _scored(arm, fits, servos, unseen)
@@ -236,7 +246,7 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
     left = np.sqrt([fit.error() / sum(map(np.sum, fit.task.rows)) for fit in fits])
     unexplained = np.sum(left > NOISE_SHARE * noise) >= LEAST_JOINTS
     if unexplained and arm.ground.root == 0.0 and np.any(arm.rigid.gravity):
-        ground, x = find_ground(arm.rigid, tasks, x)
+        ground, x = find_ground(arm.rigid, tasks, x, arm.tips)
         arm = replace(arm, ground=ground)
         tasks = replace(arm, tracks=tracks).tasks(motions)
     if arm.documented.is_ideal:

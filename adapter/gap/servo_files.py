@@ -43,7 +43,7 @@ def drives_of(servos: ServoModel, model: SelfModel) -> Drives:
         raise ModelError("the servos are where their commands are: no gain to write; fit them")
     ground, floor = servos.ground, None
     if ground.root > 0.0:
-        floor = Floor(ground.link, ground.point, ground.up, ground.height, ground.root**2)
+        floor = Floor(*ground[:4], ground.root**2, ground.rubs)
     damping = servos.velocity_gain + servos.viscous
     return Drives(
         servos.position_gain,

@@ -45,6 +45,8 @@ class Load(NamedTuple):
         other: the rigid torque beside mass times acceleration, N m.
         lift: what the hand rises by per rad of the joint, times the root of the ground's stiffness.
         gap: how far it is above the ground with the joint at zero, times the same.
+        push: what of the ground's force, over the depth times the same, acts on the joint: `lift`
+            where nothing rubs.
         side: on which side of its play the rigid torque holds the gear, -1 to 1.
     """
 
@@ -52,16 +54,18 @@ class Load(NamedTuple):
     other: Array
     lift: Array
     gap: Array
+    push: Array
     side: Array
 
 
 class Ground(NamedTuple):
-    """Something level and stiff that carries the hand where it comes down on it.
+    """Something level and stiff that carries the hand where it comes down on it, and rubs it.
 
     Attributes:
         link: (from 0) that touches it; point: (3,) m, where, in that link's frame.
         up: (3,) unit vector, base axes; height: m, over the base's origin.
-        root: of its stiffness, sqrt(N/m); 0 where there is none.
+        root: of its stiffness, sqrt(N/m), along it as well; 0 where there is none.
+        rubs: coefficient of friction, along it.
     """
 
     link: int
@@ -69,6 +73,7 @@ class Ground(NamedTuple):
     up: Array
     height: float
     root: float
+    rubs: float = 0.0
 
 
 NO_GROUND = Ground(0, np.zeros(3), np.zeros(3), 0.0, 0.0)
@@ -84,39 +89,77 @@ class Body(NamedTuple):
 
 
 @jit
-def above_ground(frames, ground, q, lift):
-    """How far the hand is above the ground, times the root of its stiffness.
+def over_ground(frames, ground, q, way, place):
+    """Where the hand is over the ground and along it, times the root of its stiffness.
 
     Args:
         frames: `Frames`; ground: `Ground`; q: (n,) rad.
-        lift: (n,) what it rises by per rad (or m) of each joint, times the same, filled.
+        way: (3, n) how far it goes up and along both axes per rad (or m) of each joint, filled.
+        place: (3,) how far it is above the ground and along both axes, filled.
     """
-    n = q.shape[0]
+    n, link, up = q.shape[0], ground.link, ground.up
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
     place_frames(frames, q, R, o)
-    link, point, up, x = ground.link, ground.point, ground.up, np.empty(3)
+    axes, x, goes = np.empty((3, 3)), np.empty(3), np.empty(3)
+    least = 0
     for r in range(3):
+        axes[0, r] = up[r]
         x[r] = o[link, r]
         for k in range(3):
-            x[r] += R[link, r, k] * point[k]
-    lift[:] = 0.0
+            x[r] += R[link, r, k] * ground.point[k]
+        if abs(up[r]) < abs(up[least]):
+            least = r
+    size = np.sqrt(1.0 - up[least] ** 2)
+    for r in range(3):
+        axes[1, r] = ((1.0 if r == least else 0.0) - up[least] * up[r]) / size
+    for r in range(3):
+        s, t = (r + 1) % 3, (r + 2) % 3
+        axes[2, r] = up[s] * axes[1, t] - up[t] * axes[1, s]
+    for i in range(3):
+        place[i] = ground.root * (axes[i, 0] * x[0] + axes[i, 1] * x[1] + axes[i, 2] * x[2])
+    place[0] -= ground.root * ground.height
+    way[:] = 0.0
     j = link
     while j >= 0:
-        u, v, w = x[0] - o[j, 0], x[1] - o[j, 1], x[2] - o[j, 2]
-        a, b, c = R[j, 0, 2], R[j, 1, 2], R[j, 2, 2]
-        risen = up[0] * (b * w - c * v) + up[1] * (c * u - a * w) + up[2] * (a * v - b * u)
-        if frames.slides[j]:
-            risen = up[0] * a + up[1] * b + up[2] * c
-        lift[j] = ground.root * risen
+        for r in range(3):
+            s, t = (r + 1) % 3, (r + 2) % 3
+            goes[r] = R[j, s, 2] * (x[t] - o[j, t]) - R[j, t, 2] * (x[s] - o[j, s])
+            if frames.slides[j]:
+                goes[r] = R[j, r, 2]
+        for i in range(3):
+            along = axes[i, 0] * goes[0] + axes[i, 1] * goes[1] + axes[i, 2] * goes[2]
+            way[i, j] = ground.root * along
         j = frames.parent[j]
-    return ground.root * (up[0] * x[0] + up[1] * x[1] + up[2] * x[2] - ground.height)
 
 
 @jit
-def all_above_ground(frames, ground, q, lift, above):
-    """Tables of `above_ground`: q (m, n); lift (m, n) and above (m,) are filled."""
+def dragged(place, anchor, most):
+    """Whether what a spring pulls (place, (3,), whose first is the height) to `anchor` slides.
+
+    The anchor, (2,), follows so far that the spring pulls no more than `most`.
+    """
+    one, other = place[1] - anchor[0], place[2] - anchor[1]
+    far = np.hypot(one, other)
+    if far <= most:
+        return False
+    share = most / far
+    anchor[0], anchor[1] = place[1] - share * one, place[2] - share * other
+    return True
+
+
+@jit
+def touches(frames, ground, q, lift, above, push):
+    """Along a motion q (m, n): lift, push (m, n), above (m,) as in `Load`, filled."""
+    way, place, anchor = np.empty((3, q.shape[1])), np.empty(3), np.zeros(2)
     for k in range(q.shape[0]):
-        above[k] = above_ground(frames, ground, q[k], lift[k])
+        over_ground(frames, ground, q[k], way, place)
+        lift[k], push[k], above[k] = way[0], way[0], place[0]
+        if place[0] < 0.0:
+            dragged(place, anchor, -ground.rubs * place[0])
+            one, other = place[1] - anchor[0], place[2] - anchor[1]
+            push[k] += (way[1] * one + way[2] * other) / place[0]
+        else:
+            anchor[:] = place[1:]
 
 
 @jit
@@ -180,8 +223,8 @@ def follow_alone(x, goal, load, start, step, q):
         error, damps = steers - at, goal[1, k] - x[WITHIN] * speed
         steers += goal[1, k] - x[A] * load.other[k] - kept_back(x, error, step * speed, damps)
         if load.gap[k] + load.lift[k] * at < 0.0:
-            steers -= x[A] * load.lift[k] * load.gap[k]
-            holds += x[A] * load.lift[k] ** 2
+            steers -= x[A] * load.push[k] * load.gap[k]
+            holds += x[A] * max(load.push[k] * load.lift[k], 0.0)
         left = step
         if speed != 0.0:
             way = 1.0 if speed > 0.0 else -1.0
@@ -215,13 +258,26 @@ def follow_together(x, goal, body, start, step, q):
     still, unit, motion = np.zeros(n), np.zeros(n), np.empty((n, 12))
     bias, column, base = np.empty(n), np.empty(n), np.zeros(12)
     mass, pull, ahead = np.empty((n, n)), np.empty(n), np.empty(n)
-    before, lift = speed.copy(), np.zeros(n)
+    before, way, place, anchor = speed.copy(), np.zeros((3, n)), np.ones(3), np.zeros(2)
+    carries, stiff = np.zeros(n), np.zeros((n, n))
     for k in range(goal.shape[1]):
-        above = 1.0
         if body.ground.root > 0.0:
-            above = above_ground(body.frames, body.ground, at, lift)
-        if above >= 0.0:
-            lift[:] = 0.0
+            over_ground(body.frames, body.ground, at, way, place)
+        if place[0] < 0.0:
+            slides = dragged(place, anchor, -body.ground.rubs * place[0])
+            place[1] -= anchor[0]
+            place[2] -= anchor[1]
+            for j in range(n):
+                carries[j] = -place[0] * way[0, j] - place[1] * way[1, j] - place[2] * way[2, j]
+            sides = 1 if slides else 3
+            for j in range(n):
+                for i in range(n):
+                    stiff[j, i] = 0.0
+                    for r in range(sides):
+                        stiff[j, i] += way[r, j] * way[r, i]
+        else:
+            anchor[:] = place[1:]
+            stiff[:], carries[:] = 0.0, 0.0
         for j in range(n):
             ahead[j] = 1.5 * speed[j] - 0.5 * before[j]
         midway = at + 0.5 * step * speed
@@ -238,7 +294,7 @@ def follow_together(x, goal, body, start, step, q):
             for i in range(n):
                 own += x[j, A] * mass[j, i] * speed[i]
             error = goal[0, k, j] - at[j]
-            pull[j] = 2.0 / step * own + goal[1, k, j] - x[j, A] * (bias[j] + lift[j] * above)
+            pull[j] = 2.0 / step * own + goal[1, k, j] - x[j, A] * (bias[j] - carries[j])
             if x[j, PLAY] > 0.0:
                 carried = bias[j]
                 for i in range(n):
@@ -252,10 +308,10 @@ def follow_together(x, goal, body, start, step, q):
                 left = pull[j]
                 for i in range(n):
                     if i != j:
-                        both = 2.0 / step * mass[j, i] + 0.5 * step * lift[j] * lift[i]
+                        both = 2.0 / step * mass[j, i] + 0.5 * step * stiff[j, i]
                         left -= x[j, A] * both * middle[i]
                 own = 2.0 / step * (x[j, A] * mass[j, j] + x[j, INERTIA])
-                own += 0.5 * step * x[j, A] * lift[j] ** 2
+                own += 0.5 * step * x[j, A] * stiff[j, j]
                 new = 0.0
                 if abs(left) > x[j, RUBS]:
                     left -= x[j, RUBS] if left > 0.0 else -x[j, RUBS]

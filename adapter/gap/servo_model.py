@@ -150,6 +150,7 @@ def ground_facts(ground: Ground, joint_names: Sequence[str]) -> dict[str, Any]:
         "up": ground.up.tolist(),
         "height": ground.height,
         "stiffness": ground.root**2,
+        "friction": ground.rubs,
     }
 
 
@@ -193,15 +194,17 @@ def _ground(path: Path, facts: Any, joint_names: tuple[str, ...]) -> Ground:
     try:
         link = joint_names.index(facts["joint"])
         height, stiffness = float(facts["height"]), float(facts["stiffness"])
+        rubs = float(facts.get("friction", 0.0))
         point, up = (np.array(facts[key], dtype=float).reshape(3) for key in ("point", "up"))
-        if not np.all(np.isfinite([*point, *up, height])) or not 0.0 < stiffness < np.inf:
+        finite = np.all(np.isfinite([*point, *up, height, stiffness, rubs]))
+        if not finite or stiffness <= 0.0 or rubs < 0.0:
             raise ValueError("a number is none of a ground")
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(
             f"{path}: [ground] needs the joint (one of {', '.join(joint_names)}), point and up of "
-            f"three numbers, height and stiffness: {error}"
+            f"three numbers, height and stiffness, perhaps friction: {error}"
         ) from error
-    return Ground(link, point, up, height, float(np.sqrt(stiffness)))
+    return Ground(link, point, up, height, float(np.sqrt(stiffness)), rubs)
 
 
 def _number(path: Path, row: Mapping[str, Any], key: str, needed: bool) -> float:

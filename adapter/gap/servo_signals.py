@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from adapter.gap.servo_kernels import LEAST_LOAD, Ground, Load, all_above_ground, between
+from adapter.gap.servo_kernels import LEAST_LOAD, Ground, Load, between, touches
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
@@ -134,22 +134,22 @@ def loads(arm: RigidArm, motion: Array, ground: Ground) -> list[Load]:
     q, dq, ddq = 0.5 * (motion[:, 1:] + motion[:, :-1])
     tau = arm.torque(q, dq, ddq)
     weightless, still, found = arm.changed(gravity=np.zeros(3)), np.zeros_like(q), []
-    lift, above = over_ground(arm, ground, q)
+    lift, above, push = over_ground(arm, ground, q)
     for j in range(arm.n):
         unit = still.copy()
         unit[:, j] = 1.0
         mass = weightless.torque(q, still, unit)[:, j]
         side = tau[:, j] / np.hypot(tau[:, j], LEAST_LOAD)
         other, gap = tau[:, j] - mass * ddq[:, j], above - lift[:, j] * q[:, j]
-        columns = mass, other, lift[:, j], gap, side
+        columns = mass, other, lift[:, j], gap, push[:, j], side
         found.append(Load(*map(np.ascontiguousarray, columns)))
     return found
 
 
-def over_ground(arm: RigidArm, ground: Ground, q: Array) -> tuple[Array, Array]:
-    """Tables of `above_ground` for q (m, n) rad: lift (m, n), above (m,)."""
+def over_ground(arm: RigidArm, ground: Ground, q: Array) -> tuple[Array, Array, Array]:
+    """Lift (m, n), above (m,) and push (m, n) along a motion q (m, n) rad, see `touches`."""
     q = np.ascontiguousarray(q)
-    lift, above = np.zeros_like(q), np.ones(len(q))
+    lift, above, push = np.zeros_like(q), np.ones(len(q)), np.zeros_like(q)
     if ground.root > 0.0:
-        all_above_ground(arm.frames, ground, q, lift, above)
-    return lift, above
+        touches(arm.frames, ground, q, lift, above, push)
+    return lift, above, push

@@ -42,8 +42,8 @@ def grounded(gap: ServoGap) -> str:
     times = [f"{plain(s, 2)} s of {name}" for name, s in fitted if s]
     said = (
         f"the link behind {link} came down at ({point}) m of its frame on something level "
-        f"{_height(gap)}, of {plain(gap.ground.root**2, 2)} N/m, for {listed(times)}; the servos "
-        "are fitted beside it"
+        f"{_height(gap)}, of {plain(gap.ground.root**2, 2)} N/m and with a coefficient of friction "
+        f"of {plain(gap.ground.rubs, 2)}, for {listed(times)}; the servos are fitted beside it"
     )
     if gap.servos.ground.root > 0.0:
         return said

@@ -27,15 +27,19 @@ QUICKEST, QUICK_STEP_S = 0.5, 1e-4  # damping over inertia times the step, from 
 FINEST_S = 5e-5  # step for which an actuator still remembers enough of its commands
 # MuJoCo takes two of its steps where this time (s) is shorter: whatever the file's step is
 STICKS = {"solreffriction": "0.0001 1", "solimpfriction": "0.9999 0.9999 0.001 0.5 2"}
-YIELDS, BALL_M = 0.01, 1e-3  # MuJoCo's impedance of the ground; radius of what touches it
+PLATE_M = 1.0, 1.0, 0.2  # half the sides of what stands for the ground
+BALL_M = 1e-5  # radius of what touches it
+HARD, HARDER = "0.99 0.99 0.001 0.5 2", 30.0  # MuJoCo's impedance of a contact; than the springs
+QUICK_S, DAMPED = 1e-3, 0.02
 
 
 class Floor(NamedTuple):
-    """Something level that carries an arm, without friction.
+    """Something level that carries an arm.
 
     Attributes:
         link: (from 0) that touches it; point: (3,) m, where, in that link's frame.
         up: (3,) unit vector, base axes; height: m, over the base's origin; stiffness: N/m.
+        friction: coefficient.
     """
 
     link: int
@@ -43,6 +47,7 @@ class Floor(NamedTuple):
     up: Array
     height: float
     stiffness: float
+    friction: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +108,8 @@ class _Writer:
             self.xml.set(option, "timestep", number_text(self.step_s))
             way = "RK4" if self.step_s == STEP_S else "implicitfast"
             self.xml.set(option, "integrator", way)
+            if self.drives.floor is not None:
+                self.xml.set(option, "cone", "elliptic")
         for name in self.model.tree.joint_names:
             for key, value in STICKS.items():
                 self.xml.set(self._named("joint", name), key, value)
@@ -205,32 +212,46 @@ class _Writer:
         return {"delay": late_s, "nsample": count, "interp": "linear"}
 
     def _floor(self, floor: Floor) -> None:
-        """A plane, and a ball at what touches it, which push one another and nothing else."""
+        """A plate on springs, and a ball at what touches it, which push one another alone."""
         model, compiled, tree = self.model, self.compiled, self.model.tree
         mujoco = optional.load("mujoco")
         data = mujoco.MjData(compiled)
         mujoco.mj_kinematics(compiled, data)
-        link = compiled.body(tree.link_names[floor.link]).id
         base = max(mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_BODY, tree.base_name), 0)
         up = matrix_from_quaternion(data.xquat[base]) @ floor.up
         place = data.xpos[base] + (floor.height - BALL_M) * up
         anchor = compiled.joint(tree.joint_names[floor.link]).pos
         point = anchor + z_to_axis(model.axis[floor.link]) @ floor.point
-        quat = quaternion_from_matrix(z_to_axis(up))
-        apart, names = {"contype": 0, "conaffinity": 0}, ("found_ground", "touches_found_ground")
-        plane = {"name": names[0], "type": "plane", "size": [1.0, 1.0, 0.01], "pos": place}
-        ball = {"name": names[1], "type": "sphere", "size": BALL_M, "mass": 0, "pos": point}
+        quat, apart = quaternion_from_matrix(z_to_axis(up)), {"contype": 0, "conaffinity": 0}
+        names = "found_ground", "touches_found_ground"
+        # MuJoCo's own contacts are springs only where they hardly hold, and then do not rub: so the
+        # springs are joints, and what touches is hard: the more, the quicker and the heavier the
+        # plate, which as light as it may be hits little
+        quick_s = max(2.0 * self.step_s, QUICK_S)
+        mass = HARDER * floor.stiffness * quick_s**2
+        damping = 2.0 * DAMPED * np.sqrt(floor.stiffness * mass)
+        spring = {"type": "slide", "stiffness": floor.stiffness, "damping": damping}
+        plate = {"name": names[0], "type": "box", "size": PLATE_M, "mass": mass}
+        inside = [_element("joint", spring | {"axis": axis}) for axis in np.eye(3)]
+        inside.append(_element("geom", plate | {"pos": [0.0, 0.0, -PLATE_M[2]]} | apart))
+        body = _element("body", {"name": names[0], "pos": place, "quat": quat, "gravcomp": 1})
         world = next(x for x in self.there if x.tag == "worldbody")
-        self.xml.insert(world, _element("geom", plane | {"quat": quat} | apart))
-        body = self._named("body", tree.link_names[floor.link])
-        self.xml.insert(body, _element("geom", ball | apart))
-        # MuJoCo's contact pushes by stiffness times depth where its reference acceleration is this
-        # times the depth: (1 - d) of the stiffness times the link's inverse mass as MuJoCo has it
-        light = float(compiled.body_invweight0[link, 0])
-        push = [-floor.stiffness * (1.0 - YIELDS) * light, 0.0]
-        pair: dict[str, Any] = {"geom1": names[0], "geom2": names[1], "condim": 1, "solref": push}
-        pair["solimp"] = [YIELDS, YIELDS, 0.001, 0.5, 2.0]
+        self.xml.insert(world, "\n".join([body.replace("/>", ">"), *inside, "</body>"]))
+        for key in (x for x in self.there if x.tag == "key" and "qpos" in x.attributes):
+            self.xml.set(key, "qpos", key.attributes["qpos"] + " 0 0 0")
+        ball = {"name": names[1], "type": "sphere", "size": BALL_M, "mass": 0, "pos": point}
+        hand = self._named("body", tree.link_names[floor.link])
+        self.xml.insert(hand, _element("geom", ball | apart))
+        pair: dict[str, Any] = {"geom1": names[0], "geom2": names[1], "condim": 1}
+        pair |= {"solref": [quick_s, 1.0], "solimp": HARD}
+        if floor.friction > 0.0:
+            pair |= {"condim": 3, "friction": [floor.friction] * 2 + [0.0] * 3}
         self._add("contact", [_element("pair", pair)])
+        if self.onto is not None:
+            self.notes.append(
+                "the ground is a plate on springs: three numbers more in qpos, the last ones; it "
+                'rubs as our simulation has it with cone="elliptic" in <option>'
+            )
 
     def _add(self, tag: str, lines: list[str]) -> None:
         """Elements into a section, which may have to be made."""

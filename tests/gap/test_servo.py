@@ -15,11 +15,13 @@ from adapter.errors import ModelError
 from adapter.gap.servo import explain
 from adapter.gap.servo_kernels import Ground, Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
-from adapter.gap.servo_signals import columns
+from adapter.gap.servo_signals import Track, columns, loads, over_ground
 from adapter.gap.servo_words import headline
 from adapter.model.spatial import Array
+from adapter.model.urdf import model_from_urdf
+from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingRefused
-from drivers.files.mcap import Log, read_position_log, write_log
+from drivers.files.mcap import Commands, Log, read_position_log, write_log
 from tests.helpers.position_arm import (
     Drawn,
     PositionArm,
@@ -28,6 +30,7 @@ from tests.helpers.position_arm import (
     named,
     position_arm,
 )
+from tests.helpers.robot_models import machine_urdf
 
 PANDA = read_robot("panda")
 
@@ -102,11 +105,12 @@ def test_only_what_is_otherwise_than_documented_is_named() -> None:
     assert gap.after.max() < 0.1 * gap.before.max()
 
 
-def test_a_table_under_the_hand_is_told_from_the_servos() -> None:
+@pytest.mark.parametrize("rubs", [0.0, 0.2])
+def test_a_table_under_the_hand_is_told_from_the_servos(rubs: float) -> None:
     """It holds and pushes several joints at once, and foretells where it does in another motion."""
     free = position_arm(41, Drawn(16.0, 10e-3, 1e-4, feeds_speed=False))
     height = 0.55
-    arm = replace(free, servos=replace(free.servos, table=(0.0, 0.0, 0.12, height, 2000.0)))
+    arm = replace(free, servos=replace(free.servos, table=(0.0, 0.0, 0.12, height, 2000.0, rubs)))
     seen = [as_log(arm.moved("points", seed)) for seed in (41, 42)]
     gap = explain(seen, PANDA, None, [as_log(arm.moved("points", 43))])
     assert gap.ground.root > 0.0
@@ -115,6 +119,7 @@ def test_a_table_under_the_hand_is_told_from_the_servos() -> None:
     assert min(gap.touched) > 1.0
     assert "the hand came down on something" in headline(gap)
     assert np.median(gap.after) < 0.2 * np.median(gap.before)
+    assert abs(gap.ground.rubs - rubs) < 0.1
     alone = explain(seen[1:], PANDA, None, [seen[0]])
     assert alone.ground.root > 0.0 == alone.servos.ground.root
 
@@ -141,7 +146,7 @@ def test_one_joint_steps_as_a_linear_servo_does() -> None:
     """Without friction it is an oscillator of the second order, whose step is known."""
     step, x = 1e-4, servo(2e-3, 0.0, 0.02, 1e-4)
     m = 10000
-    load = Load(np.full(m, 0.15), *np.zeros((4, m)))
+    load = Load(np.full(m, 0.15), *np.zeros((5, m)))
     inertia = x[0] * 0.15 + x[3]
     omega, q = inertia**-0.5, np.empty(m)
     zeta = 0.5 * x[2] * omega
@@ -164,7 +169,7 @@ def test_a_table_is_read_between_its_rows() -> None:
 def test_friction_holds_a_joint() -> None:
     """A step smaller than what friction holds moves nothing; a larger one stops short of it."""
     x, m, q = servo(0.0, 0.0, 0.05, 1e-4, 0.01), 5000, np.empty(5000)
-    load = Load(*np.zeros((5, m)))
+    load = Load(*np.zeros((6, m)))
     follow_alone(x, steers(np.full(m, 0.009)), load, np.zeros(2), 1e-3, q)
     assert not q.any()
     follow_alone(x, steers(np.full(m, 0.05)), load, np.zeros(2), 1e-3, q)
@@ -176,7 +181,7 @@ def test_a_stop_within_a_step_makes_no_jump() -> None:
     """A joint that rings and sticks ends hardly elsewhere under 0.1 microrad more of friction."""
     step, m = 1e-3, 3000
     t = step * np.arange(1, m + 1)
-    load = Load(np.full(m, 0.15), *np.zeros((4, m)))
+    load = Load(np.full(m, 0.15), *np.zeros((5, m)))
     goal = steers(0.1 * np.sign(np.sin(2.0 * np.pi * t)))
     moved = []
     for rubs in 4e-3 + 1e-7 * np.arange(300):
@@ -185,6 +190,35 @@ def test_a_stop_within_a_step_makes_no_jump() -> None:
         moved.append(q)
     assert (np.diff(moved[0])[m // 2 :] == 0.0).any()
     assert np.abs(np.diff(moved, axis=0)).max() < 2e-6
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_hand_that_is_dragged_lags_by_what_rubs(together: bool) -> None:
+    """On a gantry, pressed down: kp times the lag is damping and mu times what presses, and at rest
+    no more than that."""
+    arm = RigidArm.of(model_from_urdf(machine_urdf("gantry")))
+    names, n = ("x", "y", "z", "r"), 4
+    ground = Ground(3, np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 50.0, 0.4)
+    low = over_ground(arm, ground._replace(rubs=0.0), np.zeros((1, n)))[1][0] / ground.root
+    kp, kd = np.array([4e3, 4e3, 4e3, 40.0]), np.array([400.0, 400.0, 400.0, 2.0])
+    still = np.zeros(n)
+    servos = ServoModel(names, kp, kd, still, still, still, np.zeros(n, bool), 0.0, ground)
+    t = 1e-3 * np.arange(4000)
+    q = np.zeros((len(t), n))
+    q[:, 0] = 0.05 * np.clip(t, 0.0, 2.0)
+    q[:, 2] = -low - 0.02
+    orders = Commands((1e9 * t).astype(np.int64), np.full_like(q, np.nan), q)
+    track = Track.of(Log(Path("drag"), names, orders.stamp_ns, q, q, q, commands=orders))
+    moved = servos.follow(track, arm)
+    if not together:  # by the load that the others' motion makes
+        load = loads(arm, track.simulated(moved), ground)[0]
+        x = servos.table()[0]
+        follow_alone(x, track.goal(still, 0.0)[..., 0], load, track.start[:, 0], 1e-3, moved[:, 0])
+    press = -ground.root * over_ground(arm, ground, moved)[1]
+    drive = kp[0] * (track.commanded(0.0)[:, 0] - moved[:, 0])
+    assert press[1500] > 10.0
+    assert drive[1500] == pytest.approx(0.4 * press[1500] + kd[0] * 0.05, rel=0.02)
+    assert 0.0 < drive[-1] < 0.41 * press[-1] and np.ptp(moved[-200:, 0]) < 1e-5
 
 
 @pytest.fixture(scope="module")

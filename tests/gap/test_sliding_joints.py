@@ -15,7 +15,7 @@ import pytest
 import adapter
 from adapter.gap.load import find_load
 from adapter.gap.servo import going_on
-from adapter.gap.servo_kernels import Ground, above_ground
+from adapter.gap.servo_kernels import Ground, over_ground
 from adapter.gap.words import console_summary, headline
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
@@ -109,15 +109,17 @@ def test_fingers_in_a_recording_are_spoken_of_and_free_where_asked_for() -> None
 
 
 @pytest.mark.parametrize("robot", ["rail", "scara", "gantry"])
-def test_a_hand_rises_with_its_slides_as_differences_say(robot: str) -> None:
+def test_a_hand_goes_over_the_ground_as_differences_say(robot: str) -> None:
     model, rng = read_quietly(machine_urdf(robot)), np.random.default_rng(3)
     frames, n = frames_of(model.tree, model.lam), model.tree.n
-    ground = Ground(n - 1, rng.normal(size=3), np.array([0.1, 0.2, 0.97]), 0.3, 2.0)
-    q, lift, unused = rng.normal(size=n), np.empty(n), np.empty(n)
-    above_ground(frames, ground, q, lift)
+    up = np.array([0.1, 0.2, 0.97]) / np.linalg.norm([0.1, 0.2, 0.97])
+    ground, q = Ground(n - 1, rng.normal(size=3), up, 0.3, 2.0), rng.normal(size=n)
+    way, unused, ends = np.empty((3, n)), np.empty((3, n)), np.empty((2, 3))
+    over_ground(frames, ground, q, way, ends[0])
     for j, step in enumerate(1e-6 * np.eye(n)):
-        ends = [above_ground(frames, ground, q + sign * step, unused) for sign in (1.0, -1.0)]
-        assert lift[j] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-7)
+        for end, sign in zip(ends, (1.0, -1.0), strict=True):
+            over_ground(frames, ground, q + sign * step, unused, end)
+        assert way[:, j] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-7)
 
 
 def test_positions_and_commands_told_within_one_turn_go_on_in_the_servos_door() -> None:

@@ -24,6 +24,7 @@ from sim.hidden.motion import draw_motion
 from sim.truth import Array, Truth, documented
 
 TICK_S, STEPS = 1e-3, 8  # commands act at ticks; steps of a tick
+CREEP_M_S = 2e-3  # of a hand that friction on the table holds
 SETTLE_S = 1.0  # at the first command before the recording begins
 
 
@@ -38,7 +39,7 @@ class Servos:
         feeds_speed: the servos derive the command's speed and feed it forward.
         noise_rad: standard deviation of an encoder's reading.
         table: what the hand comes down on: where on the last link (m), its height over the base's
-            origin (m), and its stiffness (N/m); there is none where that is zero.
+            origin (m), its stiffness (N/m), none where that is zero, and coefficient of friction.
         limit: N m, of what both gains ask for; dead: rad, of an error that drives nothing;
             backlash: rad, of the gear, from end to end; servos steer by their motors, and readings
             are of the links.
@@ -52,7 +53,7 @@ class Servos:
     delay_s: float = 0.003
     feeds_speed: bool = True
     noise_rad: float = 2e-5
-    table: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    table: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     limit: Array = field(default_factory=lambda: np.full(7, np.inf))
     dead: Array = field(default_factory=lambda: np.zeros(7))
     backlash: Array = field(default_factory=lambda: np.zeros(7))
@@ -185,7 +186,11 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
         drive -= torques(body.frames, body.theta, body.base, midway, middle, still)
         if body.table[4] > 0.0:
             pose, J = end_effector(body.frames, midway, tip)
-            drive += J[2] * body.table[4] * max(body.table[3] - pose[2, 3], 0.0)
+            force = body.table[4] * max(body.table[3] - pose[2, 3], 0.0)
+            along = J[:2] @ middle
+            fast = np.hypot(along[0], along[1])
+            rubs = body.table[5] * force * np.tanh(fast / CREEP_M_S) / max(fast, 1e-9)
+            drive += J[2] * force - rubs * (along @ J[:2])
         way, rests = np.sign(dq), dq == 0.0
         ddq = np.zeros(n)
         for _ in range(2 * n):  # one joint is let go or held at a time
