@@ -10,33 +10,9 @@ import numpy as np
 import pytest
 
 from drivers.fci import codec, tables
-from drivers.fci.codec import COMMAND_DTYPE, STATE_DTYPE, CommandEncoder, StateDecoder, WireError
+from drivers.fci.codec import CommandEncoder, StateDecoder, WireError
 from tests.helpers import fci_peer
-from tests.sim.test_fci_server_codec import OFFSETS
 
-# Beside the fields of numbers: offset in protocol 5, in protocol 10.
-STATE_OFFSETS = {
-    **OFFSETS,
-    "message_id": (0, 0),
-    "motion_generator_mode": (2280, 1288),
-    "controller_mode": (2281, 1289),
-    "errors": (2282, 1290),
-    "reflex_reason": (2323, 1331),
-    "robot_mode": (2364, 1372),
-    "control_command_success_rate": (2365, 1373),
-}
-COMMAND_OFFSETS = {
-    "message_id": 0,
-    "q_c": 8,
-    "dq_c": 64,
-    "O_T_EE_c": 120,
-    "O_dP_EE_c": 248,
-    "elbow_c": 296,
-    "valid_elbow": 312,
-    "motion_generation_finished": 313,
-    "tau_J_d": 314,
-    "torque_command_finished": 370,
-}
 PROTOCOLS = pytest.mark.parametrize("protocol", [5, 10])
 Q = tuple(0.25 * k for k in range(1, 8))  # exact in f32 as well
 DQ = tuple(-0.5 * k for k in range(1, 8))
@@ -51,23 +27,6 @@ def frame(protocol, **changes):
 
 def decode(protocol, data):
     return StateDecoder(protocol).decode(memoryview(data))
-
-
-@pytest.mark.parametrize(("column", "protocol", "size"), [(0, 5, 2373), (1, 10, 1377)])
-def test_every_field_of_a_state_lies_where_the_table_says(column, protocol, size):
-    dtype = STATE_DTYPE[protocol]
-    expected = {n: o[column] for n, o in STATE_OFFSETS.items() if o[column] is not None}
-    assert {name: dtype.fields[name][1] for name in dtype.names} == expected
-    assert dtype.itemsize == size
-
-
-@pytest.mark.parametrize(("protocol", "size"), [(5, 370), (10, 371)])
-def test_every_field_of_a_command_lies_where_the_table_says(protocol, size):
-    dtype = COMMAND_DTYPE[protocol]
-    assert {n: dtype.fields[n][1] for n in dtype.names} == {
-        name: offset for name, offset in COMMAND_OFFSETS.items() if offset < size
-    }
-    assert dtype.itemsize == size
 
 
 @PROTOCOLS
