@@ -19,7 +19,6 @@ from sim.truth import Array, Truth
 PERIOD_NS = round(PERIOD_S * 1e9)
 REFRESH_TICKS = 20  # a command counts for 20 ms of plant time, then the brakes close
 BRAKE_TIME_S = 0.02  # below the full deceleration, speed dies away with this time constant
-LOCK_BELOW = 0.01  # rad/s, a slower joint is held where it is
 LOCK_RATE = 60.0  # 1/s, the critically damped hold
 RELEASE_TICKS = 100  # for which the arm only damps: what it leans on pushes it back meanwhile
 
@@ -167,7 +166,7 @@ class Plant:
     def _brake(self) -> Array:
         """Driving torque (n,) at the end of the next tick that slows down and then holds."""
         self._braked_ticks += 1
-        still = np.abs(self._dq) < LOCK_BELOW
+        still = np.abs(self._dq) < 0.01  # rad/s, a slower joint is held where it is
         stopped = self._moving & still & (self._braked_ticks > RELEASE_TICKS)
         self._lock[stopped] = self._q[stopped]
         self._moving &= ~stopped

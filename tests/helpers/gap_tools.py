@@ -101,6 +101,6 @@ def pinocchio_trial(seed: int, kind: str) -> tuple[Log, str, dict[str, Any]]:
 def write_trial(
     trial: tuple[Log, str, dict[str, Any]], folder: Path | str
 ) -> tuple[Path, Path, Path]:
-    """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths."""
+    """Write recording.mcap, nominal.urdf and truth.json; returns their paths."""
     recording, urdf, truth = trial
     return write_files(recording, urdf, truth, Path(folder))

@@ -39,7 +39,7 @@ def ask(name, payload=b""):
 def robot():
     made = Robot(build("nominal", 1), 5)
     yield made
-    made.arm.close()
+    made.arm.plant.close()
 
 
 def command(robot, tau=None, q=ZERO, dq=ZERO, end=False):
