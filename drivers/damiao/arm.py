@@ -11,7 +11,7 @@ import can
 import numpy as np
 
 from drivers.damiao import codec
-from drivers.damiao.bus import MulticastWire, Wire, open_bus, wire_of
+from drivers.damiao.bus import Wire, open_bus, wire_of
 from drivers.damiao.codec import CODES, MIT_MODE, TIMEOUT_UNIT_S, Scales, mit_command
 from drivers.damiao.connect import Dialogue
 from drivers.damiao.guardian import GuardianMode
@@ -209,8 +209,6 @@ class DamiaoArm:
             self.can_move,
         )
         self._stream = MotorStream(self._wire, self.settings, replies, self._now_ns, self._wall_ns)
-        if isinstance(self._wire, MulticastWire):
-            self._wire.ignore(self.settings.ids[-1] + 1)
         replies.others_ask = self._guardian is not None
         strange = [j + 1 for j, x in enumerate(self.limits) if type_of(x) == "unknown type"]
         if strange:
