@@ -15,12 +15,12 @@ import pytest
 
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
-from adapter.realtime.real_time import sleep_until
 from adapter.realtime.session import Session, run_lockstep
 from adapter.realtime.showing import DisplayJob
 from adapter.realtime.worker import WorkerError
 from drivers.files.mcap import read_estimates, read_log
 from drivers.interface import DriverError
+from drivers.process import sleep_until
 from tests.helpers import live_tools as tools
 
 pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]
