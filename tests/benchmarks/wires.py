@@ -151,9 +151,8 @@ def can_virtual(minutes: float) -> dict[str, Any]:
     from sim.scenarios import build
 
     far = can.Bus(interface="virtual", channel="bench")
-    near = can.Bus(interface="virtual", channel="bench")
     boards = Boards(far, build("nominal"))
-    served = ServedBus(near, boards)
+    served = ServedBus("bench", boards)
     address = "can://bench?interface=virtual"
     arm = DamiaoArm(address, allow_motion=True, bus=served)
     arm.connect()

@@ -356,9 +356,9 @@ def test_effects_in_sensors_are_refused_those_on_the_arm_are_not() -> None:
 
 
 def test_in_one_process_on_the_virtual_bus() -> None:
-    with two_buses("in process") as (near, far):
+    with two_buses("in process") as (_, far):
         boards = Boards(far, build("nominal"))
-        host = ServedBus(near, boards)
+        host = ServedBus("in process", boards)
         host.send(frame(0x7FF, refresh(6)))
         message = host.recv(0.0)
         assert message is not None
