@@ -26,7 +26,7 @@ import numpy as np
 import pybullet as bullet
 
 from sim.falls import fall
-from sim.falls.fall import RATE_HZ, FallRecord, TreeLimits, TreeTruth, babble
+from sim.falls.fall import RATE_HZ, FallRecord, TreeTruth, babble
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
@@ -239,7 +239,7 @@ def _key(truth: TreeTruth, flight: Flight) -> str:
         "format": FORMAT,
         "simulator": bullet.getAPIVersion(),
         "tree": [truth.parent, *(x.tolist() for x in (truth.R, truth.p, truth.theta))],
-        "limits": {k: getattr(truth.limits, k).tolist() for k in TreeLimits.__slots__},
+        "limits": {k: getattr(truth.limits, k).tolist() for k in fall.BOUNDS},
         "gravity": truth.gravity.tolist(),
         "feedback": [fall.BANDWIDTH, fall.DAMPING],
         "babbling": {
