@@ -127,7 +127,6 @@ class DamiaoArm:
 
     Attributes:
         limits: of each motor, as it said itself; empty before `connect`.
-        guardian_pid: of the process that holds the arm; None without one.
 
     Raises:
         DriverError: the address is wrong, or its frames do not fit on the bus.
@@ -159,11 +158,6 @@ class DamiaoArm:
         self._given_bus, self._now_ns, self._wall_ns = bus, now_ns, wall_ns
         self._bus: can.BusABC | None = None
         self._guardian: GuardianClient | None = None
-
-    @property
-    def guardian_pid(self) -> int | None:
-        """See the class."""
-        return None if self._guardian is None else self._guardian.pid
 
     def connect(self) -> None:
         """Open the bus, ask the motors who they are; with leave to move, enable and hold them.

@@ -88,11 +88,6 @@ class Ros2Arm:
         self._bridge: _Process | None = None
         self._driving, self._fault = False, ""
 
-    @property
-    def bridge_pid(self) -> int | None:
-        """Process id of the bridge; None when not connected."""
-        return None if self._bridge is None else self._bridge.pid
-
     def connect(self) -> None:
         """Start the bridge and wait until it hears the arm. Raises DriverError."""
         self.close()

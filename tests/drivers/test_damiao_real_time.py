@@ -97,7 +97,7 @@ from drivers.damiao.arm import DamiaoArm
 from tests.helpers.patience import connect
 arm = DamiaoArm(sys.argv[1], allow_motion=True)
 connect(arm)
-print(arm.guardian_pid, flush=True)
+print(arm._guardian.pid, flush=True)
 """
 LOOP = f"""{BEGIN}
 while True:
@@ -199,7 +199,7 @@ def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
     address, bank = served
     arm = DamiaoArm(address, allow_motion=True)
     connect(arm)
-    first = arm.guardian_pid
+    first = arm._guardian.pid
     assert any(f"kill {first}" in note for note in arm.intake.notes)
     for _ in range(100):
         arm.read()
@@ -216,7 +216,7 @@ def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
     assert np.isfinite(listener.read().q).all()
     listener.close()
     connect(arm)
-    second = arm.guardian_pid
+    second = arm._guardian.pid
     assert second != first
     assert wait_for(lambda: gone(first)), "the first guardian goes"
     time.sleep(0.5)

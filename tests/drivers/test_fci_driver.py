@@ -343,9 +343,9 @@ def test_a_killed_reader_is_replaced(peer5, connected):
     first = arm.read().stamp_ns // 1_000_000
     used = arm.intake.used
     for _ in range(3):
-        pid = arm.reader_pid
+        pid = arm._connection.reader.pid
         os.kill(pid, signal.SIGKILL)
-        patiently(lambda old=pid: arm.reader_pid != old, arm.read)
+        patiently(lambda old=pid: arm._connection.reader.pid != old, arm.read)
         for _ in range(50):
             arm.read()
     last = quiet(arm, peer5)
@@ -362,13 +362,13 @@ def test_a_killed_reader_is_replaced(peer5, connected):
 def test_a_spare_reader_takes_over_in_motion(in_motion, ready):
     """The motion goes on where the spare had started; where it dies as well, a new one is made."""
     arm, peer = in_motion
-    pid, spare = arm.reader_pid, arm.spare_pid
+    pid, spare = arm._connection.reader.pid, arm._connection.reader.spare_pid
     if not ready:
         os.kill(spare, signal.SIGKILL)
     os.kill(pid, signal.SIGKILL)
-    drive(arm, lambda: arm.reader_pid != pid)
-    assert (arm.reader_pid == spare) == ready
-    drive(arm, lambda: arm.spare_pid not in (pid, spare, None))
+    drive(arm, lambda: arm._connection.reader.pid != pid)
+    assert (arm._connection.reader.pid == spare) == ready
+    drive(arm, lambda: arm._connection.reader.spare_pid not in (pid, spare, None))
     sent = arm.intake.commands.sent
     drive(arm, lambda: arm.intake.commands.sent > sent + 50)
     assert peer.modes[2] == 2
@@ -378,11 +378,11 @@ def test_a_spare_reader_takes_over_in_motion(in_motion, ready):
 
 def test_a_reader_that_stands_still_is_replaced(peer5, connected):
     arm = connected(peer5)
-    pid = arm.reader_pid
+    pid = arm._connection.reader.pid
     os.kill(pid, signal.SIGSTOP)
     for _ in range(100):
         arm.read()
-    patiently(lambda: arm.reader_pid != pid, arm.read)
+    patiently(lambda: arm._connection.reader.pid != pid, arm.read)
     assert exact(arm.intake)
 
 
@@ -392,9 +392,9 @@ def test_a_reader_that_keeps_dying_is_an_error(peer5, connected, monkeypatch):
 
     def kill_again_and_again():
         for _ in range(reader_client.RESTARTS + 1):
-            pid = arm.reader_pid
+            pid = arm._connection.reader.pid
             os.kill(pid, signal.SIGKILL)
-            while arm.reader_pid == pid:
+            while arm._connection.reader.pid == pid:
                 arm.read()
 
     with pytest.raises(DriverError, match="died 5 times within 1000 s"):
@@ -412,7 +412,7 @@ def test_the_reader_goes_when_its_driver_is_killed(peer5):
         "from drivers.fci import FciArm",
         f"arm = FciArm('{peer5.address}')",
         "arm.connect()",
-        "print(arm.reader_pid, arm.spare_pid, flush=True)",
+        "print(arm._connection.reader.pid, arm._connection.reader.spare_pid, flush=True)",
         "time.sleep(100)",
     )
     driver = subprocess.Popen(
