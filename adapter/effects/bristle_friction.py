@@ -69,6 +69,10 @@ class Rubs(JointTorque):
         """s0, where it has one."""
         return float(values["s0"]) if "s0" in values else None
 
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """The level in motion, as dry friction."""
+        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
+
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The level times z, which is zero before the motion; of rows apart as if each slid."""
         dq, s0 = motion.dq[:, joint], self.bristles(values)
@@ -133,10 +137,6 @@ class BristleFriction(LearnedEffect, Rubs):
     def shares(self, shape: Array) -> Array:
         """Those of the ways around s0."""
         return shares_of_ways(shape)
-
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """The level, as dry friction."""
-        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
 
 def log_odds_of_way(s0: float) -> float:
@@ -205,10 +205,6 @@ class StribeckFriction(Rubs):
             bent = sum(x * y for x, y in zip(shares_of_ways(s0), at.bent, strict=True))
             z = np.where(s0 > WAYS_RAD[0], bent, z)
         return np.asarray(self.level(at.dq, values) * z)
-
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """What stays in motion, as dry friction."""
-        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
 
 def _falling(vs: float, s0: float | None = None) -> Template:
