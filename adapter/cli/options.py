@@ -194,7 +194,7 @@ def add_told(parser: argparse.ArgumentParser) -> None:
         dest="turn_or_zero",
         action="extend",
         default=[],
-        type=_turned,
+        type=lambda text: [(name, -1.0, 0.0) for name in names_in(text)],  # as `Told.joints`
         metavar="JOINT,...",
     )
     add("--zero", dest="turn_or_zero", action="extend", type=_zeros, metavar="JOINT=RAD,...")
@@ -204,11 +204,6 @@ def add_told(parser: argparse.ArgumentParser) -> None:
     add("--gear", metavar="G1,G2,...")
     add("--known-load", type=float, metavar="KG")
     add("--loaded", nargs="+", action="extend", default=[], type=Path, metavar="LOG")
-
-
-def _turned(text: str) -> list[tuple[str, float, float]]:
-    """As `Told.joints` has them."""
-    return [(name, -1.0, 0.0) for name in names_in(text)]
 
 
 def _zeros(text: str) -> list[tuple[str, float, float]]:

@@ -184,6 +184,7 @@ class Theta:
         self._places = self.rows.place.copy(), self.rows.base_place.copy()
         self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
         self.moments, self.newest = self.empty_moments(), self.empty_moments()
+        self._forgetting = 1e-3 / (self.settings.forget_s or np.inf)  # rate per sample
         self.count, self.weight = 0.0, 1.0
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
@@ -284,12 +285,6 @@ class Theta:
         columns, placed = self.effect_columns(table), (self._parent, *frames, self._slides)
         sums = tuple(into), self._forgetting, weight, self.rests
         return absorb(placed, self._rows, self._given, table, columns, sums)
-
-    @property
-    def _forgetting(self) -> float:
-        """Rate per sample."""
-        forget_s = self.settings.forget_s
-        return 0.0 if forget_s is None else 1e-3 / forget_s
 
     def replace_moments(self, moments: Moments, count: float) -> None:
         """Put moments rebuilt with a better λ in place of the old ones.

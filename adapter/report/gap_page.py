@@ -20,7 +20,7 @@ from adapter.report.html import fill
 from adapter.report.next_steps import Step, command
 from adapter.report.tables import Tile
 from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
-from adapter.report.words import NARROW, capital
+from adapter.report.words import NARROW, arrow, capital
 
 WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
@@ -121,35 +121,24 @@ def _tiles(result: GapResult) -> list[Tile]:
     worst = words.worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
-        fell = f"{words.fall(first, last)} {result.unit('N m', worst)}".replace("->", "→").replace(
-            " ", NARROW
-        )
+        fell = f"{words.fall(first, last)} {result.unit('N m', worst)}".replace("->", "→")
+        fell = fell.replace(" ", NARROW)
         tiles.append(Tile("Torque error", fell, f"joint {worst + 1}, the worst; rms"))
     if worst is not None and noise[worst] > 0.0:
         times = words.noise_times(result)
+        fell = arrow(times[0][worst], times[1][worst], "×")
+        level = f"noise {plain(noise[worst], 2)} {result.unit('N m', worst)}"
         tiles.append(
-            Tile(
-                "In units of its noise",
-                _arrow(times[0][worst], times[1][worst], "×"),
-                tables.tied(
-                    f"joint {worst + 1}, noise {plain(noise[worst], 2)} {result.unit('N m', worst)}"
-                ),
-            )
+            Tile("In units of its noise", fell, tables.tied(f"joint {worst + 1}, {level}"))
         )
     off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
     if off is not None and np.isfinite(off).any():
         j = int(np.nanargmax(off))
         still = np.nan if off_after is None else off_after[j]
-        value, note = (
-            _arrow(1e3 * off[j], 1e3 * still, result.unit("mrad", j)),
-            f"joint {j + 1}, rms within 0.5 s",
-        )
-        tiles.append(Tile("Forward simulation off by", value, tables.tied(note)))
+        value = arrow(1e3 * off[j], 1e3 * still, result.unit("mrad", j))
+        note = tables.tied(f"joint {j + 1}, rms within 0.5 s")
+        tiles.append(Tile("Forward simulation off by", value, note))
     return tiles
-
-
-def _arrow(before: float, after: float, unit: str) -> str:
-    return f"{plain(before, 2)} → {plain(after, 2)} {unit}".replace(" ", NARROW)
 
 
 # --- whether to trust what is named, and what to do next -----------------------------------------

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -115,16 +114,6 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)
 
 
-@dataclass(frozen=True)
-class JointPanels:
-    """Panels of one joint: clouds of its residual, and its residual and motion over time."""
-
-    title: str
-    why: str
-    clouds: Sequence[Panel]
-    times: Sequence[Panel]
-
-
 def shown_joints(result: GapResult) -> list[int]:
     """Joints (from 0) whose signatures are worth a look, the worst ones first.
 
@@ -147,8 +136,11 @@ def shown_joints(result: GapResult) -> list[int]:
     return chosen[:MOST_JOINTS] or ranked[:1]
 
 
-def signature_panels(result: GapResult) -> list[JointPanels]:
-    """The residual of the joints worth a look, against what it may depend on."""
+def signature_panels(result: GapResult) -> list[dict[str, Any]]:
+    """The residual of the joints worth a look, against what it may depend on.
+
+    Of each the title, why it is shown, clouds of the residual, and panels over time.
+    """
     panels = []
     for j in shown_joints(result):
         clouds = []
@@ -163,14 +155,15 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
             clouds.append(
                 cloud.panel(title, result.unit("N m", j), ", ".join(f.title for f in laws))
             )
-        times = [_over_time(result, j), _motion(result, j)]
         why = [result.joint_names[j]]
         said = [
             f.title for f in result.findings if j + 1 in f.joints or _worst(f.torque_rms_nm) == j
         ]
         said += ["something unexplained"] * any(x.joint == j + 1 for x in result.unexplained)
         why += [", ".join(dict.fromkeys(said))] if said else []
-        panels.append(JointPanels(f"Joint {j + 1}", "; ".join(why), clouds, times))
+        words = {"title": f"Joint {j + 1}", "why": "; ".join(why)}
+        times = [_over_time(result, j), _motion(result, j)]
+        panels.append({**words, "clouds": clouds, "times": times})
     return panels
 
 

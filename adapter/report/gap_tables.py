@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from adapter.gap.words import (
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
-from adapter.report.tables import Table
+from adapter.report.tables import Table, by_column
 from adapter.report.words import NARROW, capital
 
 UNIT = re.compile(
@@ -37,45 +37,29 @@ def tied(text: str) -> str:
     return UNIT.sub(lambda found: NARROW + found[1].replace(" ", NARROW), text)
 
 
-@dataclass(frozen=True)
-class FindingRow:
-    """A finding as it stands in the table."""
-
-    what: str
-    where: str
-    when: str
-    values: list[str]
-    evidence: str
-    worth: str
-
-
-def finding_row(findings: Sequence[Finding]) -> FindingRow:
+def finding_row(findings: Sequence[Finding]) -> dict[str, Any]:
     """What, where, when, how much, how sure: one row for what is the same on several joints."""
     first = findings[0]
     ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
     joints = sorted({j for f in ordered for j in f.joints})
-    least = min(f.evidence for f in ordered)
+    least, alone = min(f.evidence for f in ordered), len(ordered) == 1
     sure = percent(least).replace("more than", ">")
-    alone = len(ordered) == 1
     if first.recording and not alone:
         when = f"in {len({f.recording for f in ordered})} recordings"
     else:
         when = span(first) or "throughout"
-    return FindingRow(
-        what=capital(first.title),
-        where=who(first.effect, joints),
-        when=when,
-        values=[f"{_ranges(ordered)}; joint by joint below"]
-        if in_matrix(ordered)
-        else [tied(line) for line in parameter_lines(first)]
-        if alone
-        else [
+    if in_matrix(ordered):
+        values = [f"{_ranges(ordered)}; joint by joint below"]
+    elif alone:
+        values = [tied(line) for line in parameter_lines(first)]
+    else:
+        values = [
             f"{f.recording or who(f.effect, f.joints)}: {', '.join(map(tied, parameter_lines(f)))}"
             for f in ordered
-        ],
-        evidence=sure if alone or least >= 0.999 else f"{sure} and more",
-        worth=_worth(ordered),
-    )
+        ]
+    evidence = sure if alone or least >= 0.999 else f"{sure} and more"
+    row = {"what": capital(first.title), "where": who(first.effect, joints), "when": when}
+    return {**row, "values": values, "evidence": evidence, "worth": _worth(ordered)}
 
 
 def in_matrix(findings: Sequence[Finding]) -> bool:
@@ -107,26 +91,18 @@ def _unit(findings: Sequence[Finding], key: str) -> tuple[float, str]:
 def joint_matrix(result: GapResult) -> Table | None:
     """What several joints have, a row per joint and a column per parameter of an effect; None
     where no effect is of several."""
-    heads, units, columns = ["Joint"], [""], []
-    for findings in by_kind(result.findings):
-        if not in_matrix(findings):
-            continue
-        of = {f.joints[0]: f for f in findings}
-        for key in findings[0].parameters:
+    columns = [("Joint", "", list(result.joint_names))]
+    for findings in filter(in_matrix, by_kind(result.findings)):
+        first = findings[0]
+        for key in first.parameters:
             factor, unit = _unit(findings, key)
-            heads.append(capital(findings[0].title))
-            units.append(f"{key}, {unit}" + (f", {span(findings[0])}" if span(findings[0]) else ""))
-            std = {j: factor * np.asarray(f.std.get(key, np.nan), float) for j, f in of.items()}
-            columns.append(
-                {j: tied(plus_minus(factor * f.parameters[key], std[j])) for j, f in of.items()}
-            )
-    if not columns:
-        return None
-    rows = [
-        [name, *(column.get(j, DASH) for column in columns)]
-        for j, name in enumerate(result.joint_names, start=1)
-    ]
-    return Table(heads, rows, units)
+            cells = [DASH] * len(result.joint_names)
+            for f in findings:
+                std = factor * np.asarray(f.std.get(key, np.nan), float)
+                cells[f.joints[0] - 1] = tied(plus_minus(factor * f.parameters[key], std))
+            said = ", ".join(filter(None, (key, unit, span(first))))
+            columns.append((capital(first.title), said, cells))
+    return by_column(columns) if len(columns) > 1 else None
 
 
 def _worth(findings: Sequence[Finding]) -> str:

@@ -17,9 +17,9 @@ from adapter.report.gap_tables import tied
 from adapter.report.html import fill
 from adapter.report.next_steps import Step, command
 from adapter.report.style import Panel
-from adapter.report.tables import Table, Tile
+from adapter.report.tables import Table, Tile, by_column
 from adapter.report.trust import GOOD, LOOK, Check
-from adapter.report.words import NARROW, capital
+from adapter.report.words import arrow, capital
 
 SHARE, CLOSE_MRAD = 0.25, 4.0  # of the error before; or so small: the joint is explained
 MOST_SHOWN = 6  # joints whose worst moment is drawn
@@ -76,44 +76,33 @@ def render_servo_page(
     )
 
 
-def _arrow(before: float, after: float, unit: str) -> str:
-    said = f"{plain(1e3 * before, 2)} → {plain(1e3 * after, 2)} {unit}"
-    return said.replace(" ", NARROW)
-
-
 def _tiles(gap: ServoGap) -> list[Tile]:
     j = int(np.argmax(gap.before))
+    off = arrow(1e3 * gap.before[j], 1e3 * gap.after[j], "mrad")
+    at_hand = arrow(1e3 * gap.hand_before[-1], 1e3 * gap.hand_after[-1], "mm")
     numbers = sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay")
     late = [f for f in gap.findings if f.effect == "servo_delay"]
     told = f"commands act {1e3 * late[0].values[0]:.2f} ms late" if late else "no delay of commands"
     return [
         Tile("Numbers found", str(numbers), told),
-        Tile("Tracking error", _arrow(gap.before[j], gap.after[j], "mrad"), f"joint {j + 1}, rms"),
-        Tile("At the hand", _arrow(gap.hand_before[-1], gap.hand_after[-1], "mm"), gap.hand),
+        Tile("Tracking error", off, f"joint {j + 1}, rms"),
+        Tile("At the hand", at_hand, gap.hand),
     ]
 
 
 def _found(gap: ServoGap) -> Table | None:
     """Findings, a row for each joint and a column for each effect."""
-    heads, units, columns = ["Joint"], [""], []
+    columns = [("Joint", "", [f"{j} {name}" for j, name in enumerate(gap.joint_names, start=1)])]
     for finding in gap.findings:
         title, _, unit = EFFECTS[finding.effect]
         factor, shown = shown_unit(finding.values[0], unit)
-        heads.append(capital(title))
-        units.append(shown)
-        cells = dict[int, str]()
+        cells = [DASH] * len(gap.joint_names)
         rows = zip(finding.values, finding.std, finding.documented, strict=True)
         for j, (value, std, documented) in zip(finding.joints, rows, strict=True):
             known = "" if documented is None else f", not {plain(factor * documented, 3)}"
-            cells[j] = tied(f"{plus_minus(factor * value, factor * std)}{known}")
-        columns.append(cells)
-    if not columns:
-        return None
-    table = [
-        [f"{j} {name}", *(column.get(j, DASH) for column in columns)]
-        for j, name in enumerate(gap.joint_names, start=1)
-    ]
-    return Table(heads, table, units)
+            cells[j - 1] = tied(f"{plus_minus(factor * value, factor * std)}{known}")
+        columns.append((capital(title), shown, cells))
+    return by_column(columns) if len(columns) > 1 else None
 
 
 def _errors(gap: ServoGap) -> Table:

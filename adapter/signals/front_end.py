@@ -39,14 +39,8 @@ SAID = {  # of the first sample of each kind; all others are counted
     Verdict.ENCODER_JUMP: "an encoder jumped",
     Verdict.BASE_UNHEARD: "nothing is known of the base's motion; the sample was refused",
 }
-UNSEEN = (
-    Mark.SATURATED_UNTIL,
-    Mark.FIRST_MOVING,
-    Mark.SEEN,
-    Mark.AHEAD,
-    Mark.DOUBTED,
-    Mark.LAST,
-)  # stamps of what has not been yet
+# stamps of what has not been yet
+UNSEEN = (Mark.SATURATED_UNTIL, Mark.FIRST_MOVING, Mark.SEEN, Mark.AHEAD, Mark.DOUBTED, Mark.LAST)
 BASE = 9  # numbers of a floating base's motion in a sample, [v, w, a]
 FASTER = 1.1  # of the documented speed, which is then not the arm's: said, not refused
 
