@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 from rich.tree import Tree as Shown
 
@@ -111,9 +111,7 @@ def _print_lambda(learned: discovery.LearnedTree, known: np.ndarray) -> None:
 
 
 def _print_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    table = Table(box=None, pad_edge=False)
-    for heading in heads:
-        table.add_column(heading, no_wrap=True)
+    table = Table(*(Column(x, no_wrap=True) for x in heads), box=None, pad_edge=False)
     for row in rows:
         table.add_row(*row)
     output.print(table)

@@ -87,13 +87,8 @@ def _figures(
     result: replay.Replay,
 ) -> dict[str, Any]:
     front_end = result.pipeline.front_end
-    course = Course(
-        result.samples,
-        front_end.refused,
-        front_end.first_moving_ns,
-        front_end.delay_s,
-        result.ticks.summary_us(),
-    )
+    taken = result.samples, front_end.refused, front_end.first_moving_ns
+    course = Course(*taken, front_end.delay_s, result.ticks.summary_us())
     return figures(
         result.outcome,
         robot,

@@ -39,7 +39,6 @@ Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 SMOOTH_HZ = 10.0  # low-pass of motions whose torques are compared as they are
-RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
 EVEN, PAUSE_STEPS = 1e-3, 10  # share of a step by which even ones differ; most that a pause is
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
@@ -167,7 +166,7 @@ class Motion:
         def below(even: Array, step: float) -> Array:
             if not band_hz * step < 0.5:
                 return even
-            low_pass = _low_pass(band_hz, round(1.0 / step, RATE_DIGITS))
+            low_pass = _low_pass(band_hz, round(1.0 / step, 3))
             return np.asarray(sosfiltfilt(low_pass, even))
 
         return self._evenly(x, below)

@@ -153,11 +153,8 @@ def _grammar() -> tuple[Expression, ...]:
         Expression("tauⱼ", {"tau": 1}, lambda at, _: at.tau),
         Expression("tauⱼ |tauⱼ|", {"tau": 2}, lambda at, _: at.tau * np.abs(at.tau)),
     ]
-    return (
-        *out,
-        *_over_angle("sign(dq)", {}, lambda at: at.direction),
-        *_over_angle("dq", {"dq": 1}, lambda at: at.dq),
-    )
+    out += _over_angle("sign(dq)", {}, lambda at: at.direction)
+    return (*out, *_over_angle("dq", {"dq": 1}, lambda at: at.dq))
 
 
 def _over_angle(
@@ -255,12 +252,12 @@ class Law(OverSignals):
         setting = self.expression.setting
         if setting is None or setting.wave:
             return None
-        key, middle = setting.key, float(values[setting.key])
-
-        def decode(x: Array) -> dict[str, Any]:
-            return {"c": float(x[0]), key: max(middle + float(x[1]), setting.lower)}
-
-        return Template((std, setting.size), decode, linear=False)
+        key, middle, lower = setting.key, float(values[setting.key]), setting.lower
+        return Template(
+            (std, setting.size),
+            lambda x: {"c": float(x[0]), key: max(middle + float(x[1]), lower)},
+            linear=False,
+        )
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """c times the expression of signals (..., n) of all joints, or of one that has its own."""
@@ -350,11 +347,10 @@ class Curve(OverSignals):
 
     def between(self, low: float, high: float) -> Template:
         """All its coefficients over a range."""
-
-        def decode(x: Array) -> dict[str, Any]:
-            return {"x": [float(value) for value in x], "low": low, "high": high}
-
-        return Template((CURVE_NM,) * (PIECES + DEGREE), decode)
+        return Template(
+            (CURVE_NM,) * (PIECES + DEGREE),
+            lambda x: {"x": [float(value) for value in x], "low": low, "high": high},
+        )
 
     def templates(self) -> tuple[Template, ...]:
         """Over a usual range."""

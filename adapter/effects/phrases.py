@@ -125,23 +125,8 @@ SWINGS = DecidingExperiment(
 )
 
 
-# In the order of preference: what is easy to do and sure comes first.
-SPLITS = (
-    ALONE,
-    BARE,
-    FLANK,
-    LOADS,
-    WEIGHED,
-    SPEEDS,
-    STILL,
-    BOTH_WAYS,
-    LATER,
-    TURN,
-    LEVELLED,
-    KNOWN_WEIGHT,
-    TURNS,
-    SWINGS,
-)
+# As they stand above, in the order of preference: what is easy to do and sure comes first.
+SPLITS = tuple(x for x in globals().values() if isinstance(x, DecidingExperiment))
 
 
 def shown(effect: Effect, split: DecidingExperiment) -> str:

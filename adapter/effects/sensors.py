@@ -78,6 +78,13 @@ class TorqueGain(SensorEffect):
         return True
 
 
+LATENESS = (
+    (LOADS, "grows with the load"),
+    (SPEEDS, "rises in proportion to the speed"),
+    (STILL, "is gone"),
+)
+
+
 class SignalDelay(SensorEffect):
     """Torque signals that arrive later than positions; of all joints or of one.
 
@@ -96,11 +103,7 @@ class SignalDelay(SensorEffect):
         "d",
         "the torque of {who} comes {x} before the position",
     )
-    shows = (
-        (LOADS, "grows with the load"),
-        (SPEEDS, "rises in proportion to the speed"),
-        (STILL, "is gone"),
-    )
+    shows = LATENESS
 
     def possible(self, values: Values) -> bool:
         """Late, by a dozen milliseconds at most; what asks for more is something else."""
@@ -149,12 +152,7 @@ class TorqueFilter(LearnedEffect, SensorEffect):
     simpler = ((LATE, 0.03),)
     form = LATE
     phrase = Phrase("the torque sensor of {who} is a low-pass, with d = {d} and c = {c}")
-    shows = (
-        (LOADS, "grows with the load"),
-        (SPEEDS, "rises in proportion to the speed"),
-        (STILL, "is gone"),
-        (SWINGS, "makes the torque smaller"),
-    )
+    shows = (*LATENESS, (SWINGS, "makes the torque smaller"))
 
     def templates(self) -> tuple[Template, ...]:
         """Of a motor's or a sensor's electronics; and a slow one of one time constant."""

@@ -133,11 +133,8 @@ def _put(owner: object, name: str, value: np.ndarray | None) -> None:
 
 
 def _about(learner: OnlineLearner) -> str:
-    tree = learner.tree
-    about: dict[str, Any] = {
-        "parent": tree.parent,
-        "settings": dataclasses.asdict(learner.settings),
-    }
+    settings = dataclasses.asdict(learner.settings)
+    about: dict[str, Any] = {"parent": learner.tree.parent, "settings": settings}
     if learner.given:
         about["effects"] = [
             [a.effect.name, a.joint + 1, _plain(a.values), _plain(a.std)] for a in learner.given

@@ -11,15 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.learning.frame_fit import (
-    Frame,
-    best_frame,
-    descend,
-    hidden_freedom,
-    log_misfit,
-    nearest,
-    profiled_weights,
-)
+from adapter.learning import frame_fit
 from adapter.model.spatial import Array
 
 # Logarithms of what frames leave unexplained, summed over the channels.
@@ -76,13 +68,15 @@ class SchemaCheck:
             joints += [int(j) for j in np.flatnonzero(self.passed_rank != ranks)[:1]]
         return joints
 
-    def better(self, j: int, frame: Frame, start: Frame, known: Evidence) -> Frame | None:
+    def better(
+        self, j: int, frame: frame_fit.Frame, start: frame_fit.Frame, known: Evidence
+    ) -> frame_fit.Frame | None:
         """Where joint j is to start anew; None where it is right, or still on its way.
 
         Args:
             frame: where it stands; start: where it stays in what the data do not show.
         """
-        misfit, before = log_misfit(known.sums, known.samples, frame), self.misfit[j]
+        misfit, before = frame_fit.log_misfit(known.sums, known.samples, frame), self.misfit[j]
         self.misfit[j] = misfit
         due = known.rank != self.passed_rank[j] or known.samples > AGAIN * self.passed_at[j]
         if not due or (misfit < before - 0.2 and not known.still):  # ADAM is on its way
@@ -90,20 +84,22 @@ class SchemaCheck:
         found = self._solved(frame, start, known, misfit)
         self.passed_at[j], self.passed_rank[j] = known.samples, known.rank
         if found is not None:
-            self.misfit[j] = log_misfit(known.sums, known.samples, found)
+            self.misfit[j] = frame_fit.log_misfit(known.sums, known.samples, found)
             self.restarts += 1
         return found
 
     @staticmethod
-    def _solved(frame: Frame, start: Frame, known: Evidence, misfit: float) -> Frame | None:
+    def _solved(
+        frame: frame_fit.Frame, start: frame_fit.Frame, known: Evidence, misfit: float
+    ) -> frame_fit.Frame | None:
         """The closed form's frame where it is clearly better."""
         sums, count = known.sums, known.samples
-        found, _ = best_frame(sums, profiled_weights(sums, count, frame), frame)
-        weights = profiled_weights(sums, count, found)
-        found, _ = descend(sums, weights, found)
-        if log_misfit(sums, count, found) > misfit - CLEARLY_BETTER:
+        found, _ = frame_fit.best_frame(sums, frame_fit.profiled_weights(sums, count, frame), frame)
+        weights = frame_fit.profiled_weights(sums, count, found)
+        found, _ = frame_fit.descend(sums, weights, found)
+        if frame_fit.log_misfit(sums, count, found) > misfit - CLEARLY_BETTER:
             return None
-        weights = profiled_weights(sums, count, found)
-        freedom = hidden_freedom(known.clean, weights, found, known.least)
-        held = nearest(sums, weights, found, start, freedom)
-        return held if log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else found
+        weights = frame_fit.profiled_weights(sums, count, found)
+        freedom = frame_fit.hidden_freedom(known.clean, weights, found, known.least)
+        held = frame_fit.nearest(sums, weights, found, start, freedom)
+        return held if frame_fit.log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else found

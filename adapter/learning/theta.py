@@ -26,22 +26,9 @@ from adapter.effects.base import LearnedEffect
 from adapter.effects.by_joint import AT_REST, JointSignals, slowness
 from adapter.effects.catalogue import effects_by_name
 from adapter.judgement.noise import MEMORY_S
+from adapter.learning import theta_kernels as kernels
 from adapter.learning.known_effects import believed, told_shapes
 from adapter.learning.settings import LearnerSettings, Mode
-from adapter.learning.theta_kernels import (
-    Given,
-    Moments,
-    Prior,
-    Rows,
-    Weighing,
-    absorb,
-    add_information,
-    follow,
-    gradient,
-    joint_costs,
-    unfolded,
-    values,
-)
 from adapter.model.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
@@ -197,9 +184,9 @@ class Theta:
         self.x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
         self.x[self._effects_from :] = np.nan_to_num(self.believed[0]).ravel() / self.rows.steps
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
         tool = np.zeros(10) if known.tool_theta is None else np.array(known.tool_theta)
-        self._given = tuple(Given(base, tool, np.array([hand]), self.th))
+        self._given = tuple(kernels.Given(base, tool, np.array([hand]), self.th))
         self._work = np.zeros(self.P), np.zeros(self.P)
         self.updates = 0
         error = self.settings.model_error
@@ -242,14 +229,14 @@ class Theta:
         pairs = zip(self.effects, self.shapes, strict=True)
         return [effect.torque_per_unit(at, shape) for effect, shape in pairs]
 
-    def empty_moments(self) -> Moments:
+    def empty_moments(self) -> kernels.Moments:
         """Moments of no samples, to be filled by `absorb` and put in place by `replace_moments`."""
         widths = self.rows.sizes + 1
         A = np.zeros(int((widths * (widths + 1) // 2).sum()))
         floating = int(self.tree.floating)
         C = np.zeros((2 * floating, len(self.rows.near), len(self.rows.base_place) + 1))
         level = np.zeros(6 * floating), np.array([0.0, 2000.0])  # samples it spans
-        return Moments(A, C, *level, np.zeros(self.tree.n))
+        return kernels.Moments(A, C, *level, np.zeros(self.tree.n))
 
     def absorb(self, frames: tuple[Array, Array], table: Array) -> Array:
         """Add samples to the moments.
@@ -266,27 +253,31 @@ class Theta:
         if self.each_sample:
             newest = self.newest
             newest.A[:], newest.C[:] = 0.0, 0.0
-            self._absorb(frames, table[-1:], Moments(newest.A, newest.C, *_NO_LEVEL, _NOTHING))
+            self._absorb(
+                frames, table[-1:], kernels.Moments(newest.A, newest.C, *_NO_LEVEL, _NOTHING)
+            )
         self.count += self.weight * len(table)
         return error
 
-    def absorb_again(self, frames: tuple[Array, Array], table: Array, into: Moments) -> None:
+    def absorb_again(
+        self, frames: tuple[Array, Array], table: Array, into: kernels.Moments
+    ) -> None:
         """Add samples seen before to other moments, see `replace_moments`."""
-        self._absorb(frames, table, Moments(into.A, into.C, *_NO_LEVEL, into.counts))
+        self._absorb(frames, table, kernels.Moments(into.A, into.C, *_NO_LEVEL, into.counts))
 
     def errors(self, frames: tuple[Array, Array], table: Array) -> Array:
         """Torque errors (m, rows) of the parameters in use; nothing is learned."""
-        nowhere = Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL, _NOTHING)
+        nowhere = kernels.Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL, _NOTHING)
         return self._absorb(frames, table, nowhere)
 
     def _absorb(
-        self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
+        self, frames: tuple[Array, Array], table: Array, into: kernels.Moments, weight: float = 1.0
     ) -> Array:
         columns, placed = self.effect_columns(table), (self._parent, *frames, self._slides)
         sums = tuple(into), self._forgetting, weight, self.rests
-        return absorb(placed, self._rows, self._given, table, columns, sums)
+        return kernels.absorb(placed, self._rows, self._given, table, columns, sums)
 
-    def replace_moments(self, moments: Moments, count: float) -> None:
+    def replace_moments(self, moments: kernels.Moments, count: float) -> None:
         """Put moments rebuilt with a better λ in place of the old ones.
 
         What was folded into the prior at a change cannot be rebuilt; it counts half from here on.
@@ -304,7 +295,7 @@ class Theta:
         # first and one behind the last column that is not zero, of each row
         self._ranges = np.stack([np.where(some, first, 0), np.where(some, last, 0)], axis=1)
         self.prior, self.prior_rhs = H, rhs
-        self._before = tuple(Prior(H, rhs, self._ranges, 1.0))
+        self._before = tuple(kernels.Prior(H, rhs, self._ranges, 1.0))
 
     def parts(self, frames: tuple[Array, Array], settled: bool) -> tuple[Any, ...]:
         """What `steps` needs of it; `settled` as for `after_step`."""
@@ -347,11 +338,13 @@ class Theta:
             data, counts = self.newest[:2], np.ones(self.tree.n)
             floor, floor_count = np.ones_like(floor), 1e9
             H, rhs = 1e-6 * self.prior, 1e-6 * self.prior_rhs
-            prior = tuple(Prior(H, rhs, self._ranges, 1e-6))
+            prior = tuple(kernels.Prior(H, rhs, self._ranges, 1e-6))
         base = self.base_weights()
-        weighing = Weighing(counts, self.noise_gain, floor, floor_count, least, base, self.share)
+        weighing = kernels.Weighing(
+            counts, self.noise_gain, floor, floor_count, least, base, self.share
+        )
         out = *self._work, self.gradient
-        gradient(self.x, self._rows, data, prior, tuple(weighing), out)
+        kernels.gradient(self.x, self._rows, data, prior, tuple(weighing), out)
         return True
 
     def base_weights(self) -> Array:
@@ -387,7 +380,7 @@ class Theta:
         if min_eigenvalue(link + load) <= 0.0:
             return
         self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
         self.updates = 0
 
     def after_step(self, settled: bool, samples: float = 1.0) -> None:
@@ -395,14 +388,14 @@ class Theta:
         self.updates += 1
         s = self.settings
         span = max((s.settled_average if settled else s.average) / samples, 1.0)
-        follow(self.x, float(min(self.updates, span)), self.rows.steps, self.mean, self.th)
+        kernels.follow(self.x, float(min(self.updates, span)), self.rows.steps, self.mean, self.th)
 
     def variance(self, th: Array | None = None) -> Array:
         """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)².
 
         The residual is that of the parameters in use, or of others, th (P,).
         """
-        cost = joint_costs(self._rows, self.th if th is None else th, self.moments.A)
+        cost = kernels.joint_costs(self._rows, self.th if th is None else th, self.moments.A)
         own = (cost + self.floor_count * self.floor) / (self.moments.counts + self.floor_count)
         return np.asarray(own + self.model_variance)
 
@@ -413,7 +406,7 @@ class Theta:
             A: of other moments than the present ones, see `Moments`.
         """
         moments = self.moments.A if A is None else A
-        return np.asarray(unfolded(moments, self.rows.starts[j], self.rows.sizes[j] + 1))
+        return np.asarray(kernels.unfolded(moments, self.rows.starts[j], self.rows.sizes[j] + 1))
 
     def information(self) -> tuple[Array, Array]:
         """All that is known of (θ, effects): information matrix (P, P) and right side (P,).
@@ -441,12 +434,12 @@ class Theta:
             weights: (n,) of a sample of each joint, see `weights`.
         """
         H, rhs = np.zeros((self.P, self.P)), np.zeros(self.P)
-        add_information(self._rows, A, weights, H, rhs)
+        kernels.add_information(self._rows, A, weights, H, rhs)
         return H, rhs
 
     def costs(self, th: Array, A: Array) -> Array:
         """(n,) sums of squared torque errors of parameters th (P,) over the samples in A."""
-        return np.asarray(joint_costs(self._rows, th, A))
+        return np.asarray(kernels.joint_costs(self._rows, th, A))
 
     def weights(self) -> Array:
         """(n,) information of a sample of each joint's torque, 1/(N m)²."""
@@ -591,7 +584,7 @@ class Theta:
                 if not there:
                     own = self._effects_from + k * self.tree.n + j
                     self.x[own] = self.mean[own] = 0.0
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
 
     def _reduced(
         self, j: int, k: int, weight: float, known: tuple[Array, Array]
@@ -762,7 +755,7 @@ class Theta:
         self.moments.A[:], self.moments.C[:], self.count = 0.0, 0.0, 0.0
         self.moments.counts[:] = 0.0
         self.x[spare] = self.mean[spare] = self.mean[hand]
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
         # columns of the hand are the spare body's from here on
         for place, before in zip(
             (self.rows.place, self.rows.base_place), self._places, strict=True
@@ -797,7 +790,7 @@ def likely_spread(x: Array, variance: Array, spread: float) -> float:
     return math.sqrt(square)
 
 
-def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
+def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> kernels.Rows:
     """Which parameters each torque row of a tree touches, those of effects beside θ."""
     n, first = tree.n, int(tree.floating)
     bodies = tree.bodies + 1
@@ -822,13 +815,5 @@ def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
     for j, size in enumerate(sizes):  # nothing is known of rates at first
         share[j, size - len(owner) : size] = [not effects[k].by_rates for k in owner]
     steps = np.array([effect.step * effect.drums(tree.slides) for effect in effects]).ravel()
-    return Rows(
-        slot,
-        sizes,
-        starts,
-        place,
-        share,
-        every,
-        np.array(near, dtype=np.int64),
-        steps.astype(np.float64),
-    )
+    touched = np.array(near, dtype=np.int64)
+    return kernels.Rows(slot, sizes, starts, place, share, every, touched, steps.astype(np.float64))

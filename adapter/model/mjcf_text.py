@@ -117,22 +117,15 @@ def inertial_attributes(theta: Array) -> dict[str, str]:
     mass, com, tensor = body_from_theta(theta)
     principal, axes = np.linalg.eigh(tensor)
     axes[:, 0] *= np.sign(np.linalg.det(axes))  # right-handed
-    values = {
-        "pos": com,
-        "quat": quaternion_from_matrix(axes),
-        "mass": mass,
-        "diaginertia": principal,
-    }
+    values = {"pos": com, "quat": quaternion_from_matrix(axes)}
+    values |= {"mass": mass, "diaginertia": principal}
     return {key: number_text(value) for key, value in values.items()}
 
 
 def joint_attributes(more: Additions, joint: int) -> dict[str, float]:
     """What a joint has beside the rigid arm, by MuJoCo's names, of what effects spoke of."""
-    own = {
-        name: float(more.joint[place][joint])
-        for place, name in MJCF_PLACES.items()
-        if (place, joint) in more.told
-    }
+    told = {place: name for place, name in MJCF_PLACES.items() if (place, joint) in more.told}
+    own = {name: float(more.joint[place][joint]) for place, name in told.items()}
     if own.get("stiffness"):  # -stiffness (q - springref) is what MuJoCo adds
         own["springref"] = float(more.pull[joint] / -own["stiffness"])
     return own

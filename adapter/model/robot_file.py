@@ -232,12 +232,8 @@ def _moving(robot: FileRobot, wanted: Sequence[str] | None, lock: Mapping[str, f
             at = "zero" if value == 0.0 else f"{value:.6g}"
             finger = joint in own and wanted is None
             what = ", of a gripper as it seems (--joints A,B,... frees it)" if finger else ""
-            warnings.warn(
-                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}{what}; "
-                f"locked at {at}",
-                ModelWarning,
-                stacklevel=6,
-            )
+            said = f"joint '{joint.name}' is {joint.kind}{follows}{what}; locked at {at}"
+            warnings.warn(f"{robot.file}: {said}", ModelWarning, stacklevel=6)
     return chosen
 
 

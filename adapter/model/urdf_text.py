@@ -149,11 +149,9 @@ def carried(model: SelfModel, more: Additions) -> tuple[Carried, Carried]:
 
 def unplaced(model: SelfModel, more: Additions) -> list[str]:
     """What a URDF has no place for, in words; its gravity is upright."""
-    upright = np.array_equal(model.gravity, gravity_down())
-    return [
-        *([] if upright else [f"gravity {model.gravity.tolist()} m/s2 in base axes"]),
-        *more.left_out,
-    ]
+    if np.array_equal(model.gravity, gravity_down()):
+        return more.left_out
+    return [f"gravity {model.gravity.tolist()} m/s2 in base axes", *more.left_out]
 
 
 def comment_text(left_out: list[str]) -> str:

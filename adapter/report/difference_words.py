@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from adapter.runs.compare import BODY, FRAME, GRAVITY, NOTHING, SIGNIFICANT, Change, ModelDifference
+from adapter.runs.terminal import json_ready
 
 MATRIX_HEADS = ("joint", "its frame in the one before", "the link behind it")
 EFFECT_HEADS = ("effect", "from A to B, joint by joint", "z", "N m")
 LEGEND = "z: standard deviations; N m, mm: what it alone does to torque and to the hand, rms"
-MOSTLY = 0.5  # share that data can show, below which it is told
 
 
 def difference_matrix(found: ModelDifference) -> list[tuple[str, ...]]:
@@ -108,7 +108,7 @@ def _change_words(change: Change) -> str:
             f"{'' if key == GRAVITY else key + ' '}{_number(a)} -> {_number(b)} {change.units[key]}"
             for key, (a, b) in values.items()
         )
-    if change.shown >= MOSTLY:
+    if change.shown >= 0.5:
         return words
     share = f"{100.0 * change.shown:.2g} % of it" if change.shown else "none of it"
     return f"{words} (data can show {share})"
@@ -123,25 +123,7 @@ def _number(value: Any) -> str:
 
 def difference_json(found: ModelDifference) -> dict[str, Any]:
     """Everything, ready for JSON."""
-    changes = [
-        {
-            **asdict(change),
-            "values": {
-                key: [None if x is None else np.asarray(x).tolist() for x in pair]
-                for key, pair in change.values.items()
-            },
-            "listed": _listed(change),
-        }
-        for change in found.changes
-    ]
-    return {
-        "models": list(found.names),
-        "changes": changes,
-        "joints": list(found.joints),
-        "torque_nm": found.torque_nm.tolist(),
-        "torque_size_nm": found.torque_size_nm.tolist(),
-        "hand": found.hand,
-        "hand_rms_m": found.hand_rms_m,
-        "hand_max_m": found.hand_max_m,
-        "summary": difference_summary(found),
-    }
+    changes = [{**asdict(change), "listed": _listed(change)} for change in found.changes]
+    told = {**asdict(found), "changes": changes, "summary": difference_summary(found)}
+    told["models"] = told.pop("names")
+    return dict(json_ready(told))

@@ -22,7 +22,6 @@ from adapter.runs.fleet.course import Drift, StandsOut
 from adapter.runs.fleet.fleet import Fleet
 
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
-FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 MOST_ROWS = 300  # of recordings on the page; of more those to say something of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
@@ -51,7 +50,7 @@ def _log_cells(log: OfLog) -> tuple[str, ...]:
         "" if log.load is None else _signed(*log.load),
         f"{log.rmse[worst]:.3f} ({worst + 1})",
         _less(log.worth),
-        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
+        " ".join(map(str, log.disagrees)) if len(log.disagrees) < 4 else "everywhere",
     )
 
 
@@ -233,10 +232,8 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
         drawing = Drawing("half")
         ax = drawing.axes[0]
         for j in range(used[0].effects.shape[1]):
-            y, std = (
-                np.array([getattr(log, key)[k, j] for log in used])
-                for key in ("effects", "effects_std")
-            )
+            y = np.array([log.effects[k, j] for log in used])
+            std = np.array([log.effects_std[k, j] for log in used])
             look = ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)
             look.set_label(str(j + 1))
         legend(ax, ncols=8, fontsize=6, loc="lower center", bbox_to_anchor=(0.5, 0.98))

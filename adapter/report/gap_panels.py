@@ -36,11 +36,9 @@ if TYPE_CHECKING:
 
 
 MOST_JOINTS = 3  # with signatures
-MOST_DOTS = 500  # of one cloud; a panel shows no more
 BINS, FEWEST_IN_BIN = 24, 4
 WIDEST = 99.5  # percentile of |residual| that a panel still holds
 SHOWN_ROLLOUT_S = 10.0
-LEFT_OUT_S = 1.0  # between two points of a line: it breaks
 LEFT = 0.17  # of a small panel, where "−0.050" must fit
 SIGNATURES = (
     ("dq", "Against velocity", "velocity, rad/s"),
@@ -230,7 +228,7 @@ def _dots(ax: Axes, x: Array, y: Array, color: str) -> None:
     keep = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not keep.size:
         return
-    keep = keep[np.unique(np.linspace(0, len(keep) - 1, MOST_DOTS).astype(int))]
+    keep = keep[np.unique(np.linspace(0, len(keep) - 1, 500).astype(int))]  # no more
     points = np.repeat(np.column_stack([x[keep], y[keep]]), 2, axis=0)
     path = Path(points, np.tile([Path.MOVETO, Path.LINETO], len(keep)))
     path.should_simplify = False
@@ -269,7 +267,7 @@ def _over_time(result: GapResult, j: int) -> Panel:
 def _line(t: Array, y: Array) -> tuple[Array, Array]:
     """A line over time, thinned, with a break where time is left out."""
     t, y = thin(t, y)
-    breaks = np.flatnonzero(np.diff(t) > LEFT_OUT_S) + 1
+    breaks = np.flatnonzero(np.diff(t) > 1.0) + 1  # s
     return np.insert(t, breaks, t[breaks]), np.insert(y, breaks, np.nan)
 
 

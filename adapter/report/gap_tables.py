@@ -8,18 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from adapter.gap import words
 from adapter.gap.phrases import parameter_lines, shown_unit, who
 from adapter.gap.result import Finding, GapResult, Unseen
-from adapter.gap.words import (
-    alike,
-    by_kind,
-    carried_words,
-    noise_times,
-    percent,
-    shares_of,
-    span,
-    title_of,
-)
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
@@ -43,11 +34,11 @@ def finding_row(findings: Sequence[Finding]) -> dict[str, Any]:
     ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
     joints = sorted({j for f in ordered for j in f.joints})
     least, alone = min(f.evidence for f in ordered), len(ordered) == 1
-    sure = percent(least).replace("more than", ">")
+    sure = words.percent(least).replace("more than", ">")
     if first.recording and not alone:
         when = f"in {len({f.recording for f in ordered})} recordings"
     else:
-        when = span(first) or "throughout"
+        when = words.span(first) or "throughout"
     if in_matrix(ordered):
         values = [f"{_ranges(ordered)}; joint by joint below"]
     elif alone:
@@ -92,7 +83,7 @@ def joint_matrix(result: GapResult) -> Table | None:
     """What several joints have, a row per joint and a column per parameter of an effect; None
     where no effect is of several."""
     columns = [("Joint", "", list(result.joint_names))]
-    for findings in filter(in_matrix, by_kind(result.findings)):
+    for findings in filter(in_matrix, words.by_kind(result.findings)):
         first = findings[0]
         for key in first.parameters:
             factor, unit = _unit(findings, key)
@@ -100,7 +91,7 @@ def joint_matrix(result: GapResult) -> Table | None:
             for f in findings:
                 std = factor * np.asarray(f.std.get(key, np.nan), float)
                 cells[f.joints[0] - 1] = tied(plus_minus(factor * f.parameters[key], std))
-            said = ", ".join(filter(None, (key, unit, span(first))))
+            said = ", ".join(filter(None, (key, unit, words.span(first))))
             columns.append((capital(first.title), said, cells))
     return by_column(columns) if len(columns) > 1 else None
 
@@ -117,19 +108,19 @@ def _worth(findings: Sequence[Finding]) -> str:
 def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
     """(findings, what else they could be and how much of them that explains, how to tell)."""
     rows = []
-    for findings in alike(result.findings):
-        shares = shares_of(findings)
+    for findings in words.alike(result.findings):
+        shares = words.shares_of(findings)
         if shares:
             joints = sorted(j for f in findings for j in f.joints)
             where = f"{capital(findings[0].title)}, {who(findings[0].effect, joints)}"
-            said = ", ".join(f"{title_of(name)} {share}" for name, share in shares)
+            said = ", ".join(f"{words.title_of(name)} {share}" for name, share in shares)
             rows.append((where, said, findings[0].split_by))
     return rows
 
 
 def carried_table(result: GapResult) -> Table | None:
     """What each of several recordings carries; None for one."""
-    rows = [[load.recording, *map(tied, carried_words(load))] for load in result.loads]
+    rows = [[load.recording, *map(tied, words.carried_words(load))] for load in result.loads]
     return Table(["Recording", "Load", "Where"], rows) if rows else None
 
 
@@ -145,7 +136,7 @@ def unseen_table(result: GapResult) -> Table | None:
         of = {x.joint: plain(factor * x.size, 2) for x in every}
         cells = [of.get(j, DASH) for j in range(len(heads) - 1)]
         way = "above" if every[0].above else "below"
-        body.append([f"{capital(title_of(effect))} {way}, {unit}", *cells])
+        body.append([f"{capital(words.title_of(effect))} {way}, {unit}", *cells])
     return Table(heads, body) if body else None
 
 
@@ -156,7 +147,7 @@ def error_table(result: GapResult) -> Table:
     own = result.unit("N m")
     units = ["", own, *[f"torque, {own}"] * 2, *["× noise"] * 2]
     noise = np.asarray(result.noise_floor_nm, dtype=float)
-    columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *noise_times(result)]
+    columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *words.noise_times(result)]
     for unit, key in (
         ("rollout, mrad", "rollout_rmse_rad"),
         ("rollout, mrad/s", "rollout_rmse_rad_s"),

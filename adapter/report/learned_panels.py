@@ -45,7 +45,6 @@ SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time t
 FIRST_S = 0.05  # left end of a logarithmic time axis
 LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
 SETTLED = "inside both goals"
-SHOWN_FIT_S = 20.0  # of the end of the run
 SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
 SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the panel
 FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
@@ -263,9 +262,9 @@ def error_by_joint(data: RunData) -> Panel:
 
 
 def fit_window(data: RunData) -> Array:
-    """Which rows of the score (bool) the fit is shown for: after the last change, at the end."""
+    """Which rows of the score (bool) the fit is shown for: after the last change, the last 20 s."""
     t = data.times(data.score_trace)
-    start = max([t[-1] - SHOWN_FIT_S, *change_times(data)])
+    start = max([t[-1] - 20.0, *change_times(data)])
     return np.asarray(t >= start)
 
 

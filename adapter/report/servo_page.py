@@ -22,7 +22,6 @@ from adapter.report.trust import GOOD, LOOK, Check
 from adapter.report.words import arrow, capital
 
 SHARE, CLOSE_MRAD = 0.25, 4.0  # of the error before; or so small: the joint is explained
-MOST_SHOWN = 6  # joints whose worst moment is drawn
 TITLES = tuple(title for title, _, _ in EFFECTS.values())  # what the table has, not the headline
 SLOW_RAD_S, MOSTLY = 0.1, 0.5  # where more than that share of what is left is
 
@@ -129,7 +128,7 @@ def _arms(numbers: Sequence[ServoNumber]) -> Table | None:
 def _moments(gap: ServoGap) -> list[Panel]:
     """The seconds in which the new servos are most off, of the joints that are most off."""
     panels = []
-    for j in np.argsort(-gap.after)[:MOST_SHOWN].tolist():
+    for j in np.argsort(-gap.after)[:6].tolist():
         each = []
         for name, x in gap.curves:
             start, stop = worst_window(x.t, left := x.after[:, j] - x.measured[:, j])

@@ -258,8 +258,7 @@ def schema_table(data: RunData) -> Table:
         "R = Rz(α) Rx(β) Rz(γ). Angles of one frame may differ and mean the same frame; "
         "what motion does not show is taken from the documentation."
     )
-    units = ["", "rad", "rad", "rad", "m", "m", "m"]
-    return Table(["Joint", "α", "β", "γ", "p x", "p y", "p z"], rows, units, note)
+    return Table(["Joint", "α", "β", "γ", "p x", "p y", "p z"], rows, ["", *LAMBDA_UNITS], note)
 
 
 def provenance_rows(data: RunData) -> list[tuple[str, str, bool]]:

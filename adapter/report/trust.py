@@ -167,8 +167,6 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
 
 GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
 LEFT = "Torque not explained"
-FEW_MISSED, MANY_MISSED = 1e-3, 1e-2  # shares of all deadlines
-FEW_REFUSED = 0.05  # share of all samples
 
 
 @dataclass(frozen=True)
@@ -334,8 +332,8 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
             f"{quantity(plant.get('p99'), 'µs')}, which waits where it is late: nothing is lost"
         )
     share = missed / deadlines
-    bad = share >= MANY_MISSED and not is_simulated(figures)
-    verdict = GOOD if share < FEW_MISSED else BAD if bad else LOOK
+    bad = share >= 1e-2 and not is_simulated(figures)
+    verdict = GOOD if share < 1e-3 else BAD if bad else LOOK
     return Check(verdict, "Timing", said)
 
 
@@ -350,5 +348,5 @@ def _samples(figures: Mapping[str, Any]) -> Check:
     gaps = len(figures.get("gaps") or [])
     if gaps:
         said += f"; {gaps} gap{'' if gaps == 1 else 's'} in the stamps"
-    bad = not learned or lost or learned < (1.0 - FEW_REFUSED) * samples
+    bad = not learned or lost or learned < 0.95 * samples
     return Check(LOOK if bad and learned else BAD if bad else GOOD, "Samples", said)

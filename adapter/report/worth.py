@@ -151,10 +151,8 @@ def hand_off_m(data: RunData) -> float | None:
     """How far (rms over postures of the run, m) the outermost link stands from where the
     documentation puts it; None where no posture or no such link is known."""
     q = some_postures(data)
-    tips = [
-        [placed_arm(data, lam, row).tips for row in q]
-        for lam in (data.documented.lam, data.model.lam)
-    ]
+    both = data.documented.lam, data.model.lam
+    tips = [[placed_arm(data, lam, row).tips for row in q] for lam in both]
     apart = [
         np.linalg.norm(there[j] - here[j]) for there, here in zip(*tips, strict=True) for j in there
     ]
@@ -238,10 +236,8 @@ def _lacks(data: RunData, fall: Fall) -> list[Finding]:
 
 def _bodies(data: RunData, held: list[Mapping[str, Any]]) -> Array:
     """(n,) N m rms of what links change that weigh otherwise than documented, beside loads."""
-    loads = tuple(
-        {"effect": "payload", "parameters": {key: load[key] for key in ("m", "cx", "cy", "cz")}}
-        for load in held
-    )
+    told = [{key: load[key] for key in ("m", "cx", "cy", "cz")} for load in held]
+    loads = tuple({"effect": "payload", "parameters": parameters} for parameters in told)
     before = replace(data.documented, effects=(*data.documented.effects, *loads))
     after = replace(data.documented, theta=data.model.theta)
     return rms_of([_torque(data, after) - _torque(data, before)]).value

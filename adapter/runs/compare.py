@@ -293,11 +293,8 @@ def _effects(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
     for at in sorted(tables[0].keys() | tables[1].keys()):
         was, now = (table.get(at, []) for table in tables)
         before, after = ({k: v for a in found for k, v in a.values.items()} for found in (was, now))
-        values = {
-            key: (before.get(key), after.get(key))
-            for key in before | after
-            if not _same(before.get(key), after.get(key))
-        }
+        pairs = {key: (before.get(key), after.get(key)) for key in before | after}
+        values = {key: pair for key, pair in pairs.items() if not _same(*pair)}
         if not values:
             continue
         std = [{k: s for a in found for k, s in a.std.items()} for found in (was, now)]

@@ -26,10 +26,7 @@ from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfMod
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
-from adapter.physics.identifiability import (
-    BaseParameters,
-    random_regressor,
-)
+from adapter.physics.identifiability import BaseParameters, random_regressor
 from adapter.signals.records import LinkMotionKind
 
 TORQUE_GOAL = 1.1  # times the final batch least squares

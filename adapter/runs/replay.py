@@ -30,7 +30,6 @@ from adapter.signals.validation import Rms, errors_of_pieces, rms_of, validation
 from drivers.files.mcap import Log, mapped
 from drivers.interface import DriverError
 
-FEWEST_FOR_NOISE = 50  # samples
 # States that pass the front end in one table: as much as a processor's cache holds. Of the exact
 # mode whole times `ADOPT_EVERY`.
 AT_ONCE = 2000
@@ -259,7 +258,7 @@ def noise_levels(log: Log) -> dict[str, Array]:
 def _noise_levels(log: Log) -> dict[str, Array]:
     new = np.ones(len(log), dtype=bool)
     new[1:] = (np.diff(log.dq, axis=0) != 0).any(axis=1)
-    if new.sum() < FEWEST_FOR_NOISE:
+    if new.sum() < 50:  # samples
         return {name: np.full(log.dq.shape[1], np.nan) for name in ("q", "dq", "tau")}
     return {
         name: noise_from_samples(np.nan_to_num(getattr(log, name)[new]))

@@ -12,26 +12,19 @@ from numpy.typing import NDArray
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.screening.likelihood import (
-    EVIDENCE,
-    ROWS,
-    Rows,
-    Telling,
-    explains_nothing,
-    lateness_s,
-)
+from adapter.screening.likelihood import EVIDENCE, ROWS, Rows, Telling, explains_nothing, lateness_s
 from adapter.screening.readings import angle, other_hand, otherwise_told
 from adapter.screening.rows import pauses, stuck
 from adapter.screening.timing import (
     RecordingClock,
     check_timing,
     put_forward,
+    source_stamps,
     uniform,
     unsaid,
     unwrapped,
 )
 from adapter.signals.matching import matching, most_moved, several
-from adapter.signals.source_clock import source_stamps
 from adapter.signals.told import told_of
 from adapter.signals.validation import GRID_S, smooth
 from drivers.files.mcap import Log

@@ -26,8 +26,6 @@ from adapter.model.spatial import Array
 FEWEST = 5  # numbers that a line, or what stands out beside others, takes
 CHANCE = 0.01  # of one false alarm among all that is asked of an arm
 TOLD_APART = 0.01  # that one column matters beside another one, by chance
-COLLINEAR = 1e-8  # share of a column that others leave
-MOST_OUT = 0.25  # share of the recordings that may stand out
 FARTHEST = 3.0  # standard deviations that a scatter counts for away from the usual one
 MOST_FREEDOM = 16.0  # what all say of one, as so many numbers of its own; more, and a tail counts
 TINY = 1e-300
@@ -173,7 +171,7 @@ def _standing_out(
     for k, (one, fit) in enumerate(zip(series, fits, strict=True)):
         if fit is None or fit.freedom < FEWEST - 2:
             continue
-        if len(fit.left) <= (1.0 - MOST_OUT) * len(one.values):
+        if len(fit.left) <= 0.75 * len(one.values):  # no more may stand out
             continue
         rest = np.maximum(1.0 - fit.leverage, TINY)
         away = fit.left / rest
@@ -225,7 +223,7 @@ def _fit(one: Series, follows: Sequence[Array], use: NDArray[np.bool_]) -> Fit |
     scaled = [(x[use] - m) / s for x, m, s in zip(follows, middle, size, strict=True)]
     rows = np.column_stack([np.ones(int(use.sum())), *scaled]) / one.std[use, None]
     sides, values, turn = np.linalg.svd(rows, full_matrices=False)
-    if values[-1] <= COLLINEAR * values[0]:
+    if values[-1] <= 1e-8 * values[0]:  # of a column others leave nothing
         return None
     target = one.values[use] / one.std[use]
     back = np.diag(np.r_[1.0, 1.0 / size])  # to the columns' own units

@@ -205,9 +205,7 @@ def _learning(model: SelfModel) -> LearnerSettings:
     return LearnerSettings(effects=effects_for(model))
 
 
-@lru_cache(maxsize=4)
-def _model(text: str) -> SelfModel:
-    return model_file.loads(text)
+_model = lru_cache(maxsize=4)(model_file.loads)
 
 
 @contextmanager
