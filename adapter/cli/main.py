@@ -62,9 +62,7 @@ COMMANDS = {  # in the order of --help
         begins="learning from {logs}",
     ),
     "gap": Command(
-        model_options.declare_gap,
-        "find what a model lacks",
-        begins="comparing {model} with {logs}",
+        model_options.declare_gap, "find what a model lacks", begins="comparing {model} with {logs}"
     ),
     "effects": Command(model_options.declare_effects, "what can be named, and laws of one's own"),
     "fleet": Command(

@@ -116,10 +116,7 @@ def random_regressor(
 
 
 def base_parameters(
-    tree: Tree,
-    lam: Array,
-    gravity: Array,
-    extra: ExtraColumns | None = None,
+    tree: Tree, lam: Array, gravity: Array, extra: ExtraColumns | None = None
 ) -> BaseParameters:
     """The identifiable subspace of θ, from the regressor over random motion.
 

@@ -465,10 +465,7 @@ def _judged(
 
 
 def judged_rows(
-    log: Log,
-    model: SelfModel,
-    smoothed: Sequence[Array],
-    unit_known: bool = False,
+    log: Log, model: SelfModel, smoothed: Sequence[Array], unit_known: bool = False
 ) -> tuple[Rows, Telling]:
     """The instants of a recording that are judged, and by what; see `judged`."""
     q, dq, ddq, tau = (x[EDGE:-EDGE] for x in smoothed)
