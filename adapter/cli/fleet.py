@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.progress import Progress
-from rich.table import Table
+from rich.table import Column
 
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
@@ -19,7 +19,7 @@ from adapter.model.model_file import save_model, whole_file
 from adapter.report import fleet_page
 from adapter.runs.fleet import fleet
 from adapter.runs.fleet.arm import FleetArm
-from adapter.runs.terminal import console, output, results_folder, say, show, warn, write_json
+from adapter.runs.terminal import console, print_table, results_folder, say, show, warn, write_json
 
 
 def run(args: argparse.Namespace) -> int:
@@ -27,12 +27,11 @@ def run(args: argparse.Namespace) -> int:
     robot = robot_of(args, args.model)
     given = fleet.found_logs(args.logs)
     folder = results_folder(args.out, "fleet")
-    manifest = (
-        fleet.Manifest({}, {}) if args.manifest is None else fleet.read_manifest(args.manifest)
-    )
-    settings = fleet.Settings(
-        folder, args.workers, args.cluster, args.by, manifest, args.topic, told_of(args)
-    )
+    manifest = fleet.Manifest({}, {})
+    if args.manifest is not None:
+        manifest = fleet.read_manifest(args.manifest)
+    how = args.workers, args.cluster, args.by, manifest, args.topic
+    settings = fleet.Settings(folder, *how, told_of(args))
     fleet.forget(args.forget, robot, settings)
     fleet.recall(args.remember, robot, settings)
     say(f"{len(given)} recordings; moments are kept in {folder}")
@@ -122,12 +121,8 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
 
 def _print(arm: FleetArm) -> None:
     shown = fleet_page.to_be_shown(arm, 40)  # of more, those that there is something to say of
-    table = Table(box=None, pad_edge=False, title=arm.name, title_justify="left")
-    for number, head in enumerate(fleet_page.HEADS):
-        table.add_column(head, no_wrap=number > 0, overflow="fold")
-    for row in fleet_page.log_rows(arm, shown):
-        table.add_row(*row)
-    output.print(table)
+    heads = [Column(x, no_wrap=k > 0, overflow="fold") for k, x in enumerate(fleet_page.HEADS)]
+    print_table(heads, fleet_page.log_rows(arm, shown), title=arm.name, title_justify="left")
     if len(shown) < len(arm.logs):
         show(f"{len(arm.logs) - len(shown)} recordings of which nothing is to be said")
     for line in fleet_page.sentences(arm):

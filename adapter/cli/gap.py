@@ -37,10 +37,8 @@ from adapter.screening.screen import RecordingRefused
 from adapter.simulate import Rollouts
 from drivers.files.mcap import Log, read_log, read_position_log
 
-WITH_TORQUE = (  # options
-    *("validate_from", "rounds", "turn_or_zero", "tau", "trust_log"),
-    *("tau_gain", "gear", "known_load"),
-)
+WITH_TORQUE = ["validate_from", "rounds", "turn_or_zero", "tau", "trust_log"]
+WITH_TORQUE += ["tau_gain", "gear", "known_load"]  # options
 
 
 def run(args: argparse.Namespace) -> int:
@@ -166,10 +164,8 @@ def _position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | No
             )
         return None
     if without:
-        raise UsageError(
-            f"{', '.join(map(str, without))}: not commands and positions alone, as the others are; "
-            "give recordings of one kind"
-        )
+        said = "not commands and positions alone, as the others are; give recordings of one kind"
+        raise UsageError(f"{', '.join(map(str, without))}: {said}")
     found = {path: log for path, log in read.items() if log is not None}
     return [found[path] for path in args.logs], [found[path] for path in args.hold_out]
 
@@ -204,9 +200,8 @@ def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list
     page = folder / "report.html"
     page.unlink(missing_ok=True)  # of an earlier result
     if not args.no_report:
-        facts["report"] = str(
-            write_whole(page, render_servo_page(gap, str(args.model), target, numbers))
-        )
+        text = render_servo_page(gap, str(args.model), target, numbers)
+        facts["report"] = str(write_whole(page, text))
     _write(args, folder, facts)
     for line in servo_words.lines(gap):
         terminal.output.print(Text.from_markup(line), soft_wrap=True)

@@ -67,6 +67,7 @@ if TYPE_CHECKING:
 
 DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
+AS_TOLD = ("set_aside", "skipped", "restarts", "recorded", "unrecorded", "tracking")  # by the loop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,9 +172,8 @@ def run(args: argparse.Namespace) -> int:
     if isinstance(driver, FaultyDriver):
         terminal.show(driver.account.line())
     notes = [] if result.tracking is None else result.tracking["notes"]
-    terminal.warn(
-        ([result.fault] if result.fault else []) + result.troubles + result.intake.notes + notes
-    )
+    fault = [result.fault] if result.fault else []
+    terminal.warn([*fault, *result.troubles, *result.intake.notes, *notes])
     if result.unrecorded:
         share = 100.0 * result.unrecorded / result.samples
         terminal.warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
@@ -248,9 +248,8 @@ def _go(
     later: list[Callable[[], Path] | None] = []
 
     def before_motion(stopped: Callable[[], bool]) -> None:
-        terminal.warn(
-            driver.intake.notes
-        )  # who holds the arm, say; again with what came later at the end
+        # who holds the arm, say; again with what came later at the end
+        terminal.warn(driver.intake.notes)
         if controller is None:
             terminal.warn(filter(None, [another_robot(driver, MotionLimits.of(robot))]))
         elif maybe_real:
@@ -268,14 +267,9 @@ def _go(
         watching = FollowingObserver(observer, safety.stop_at_contact, names)
         if controller is not None:
             controller.observer = observer
-    result = run_live(
-        driver,
-        front_end,
-        controller,
-        Jobs(learner, recording, display, together([_view_job(args, known), publisher])),
-        LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
-        say=terminal.say,
-    )
+    jobs = Jobs(learner, recording, display, together([_view_job(args, known), publisher]))
+    options = LiveOptions(duration_s, deadman, before_motion=before_motion, observer=watching)
+    result = run_live(driver, front_end, controller, jobs, options, say=terminal.say)
     for write in filter(None, later):
         write()
     if watching is None:
@@ -328,14 +322,9 @@ def _recording(
     args: argparse.Namespace, plan: RunPlan, driver: Driver, folder: Path, truth: Path | None
 ) -> RecordingJob:
     """The recording, with all that a replay needs to repeat the run."""
-    metadata = recording_metadata(
-        plan.config,
-        plan.robot,
-        shlex.join(sys.argv[1:]),
-        driver=args.driver,
-        scenario=args.scenario,
-        commands_without_gravity=driver.adds_gravity,
-    )
+    how = {"driver": args.driver, "scenario": args.scenario}
+    how["commands_without_gravity"] = driver.adds_gravity
+    metadata = recording_metadata(plan.config, plan.robot, shlex.join(sys.argv[1:]), **how)
     attachments = {"documented.json": dumps(plan.robot).encode()}
     if truth is not None:
         attachments["truth.json"] = truth.read_bytes()
@@ -359,19 +348,13 @@ def _conclude(
     lost = result.unlearned + result.passed_on - outcome.learned
     if lost:
         refused["not_reached_learner"] = lost
+    taken = result.samples, refused, front_end.first_moving_ns, front_end.delay_s
+    slow_s = 0.0 if result.tracking is None else plan.config.excitation.slow_s
     numbers = figures(
         outcome,
         robot,
         reference,
-        Course(
-            result.samples,
-            refused,
-            front_end.first_moving_ns,
-            front_end.delay_s,
-            result.timing.tick_us,
-            result.timing.missed_deadlines,
-            0.0 if result.tracking is None else plan.config.excitation.slow_s,
-        ),
+        Course(*taken, result.timing.tick_us, result.timing.missed_deadlines, slow_s),
         warnings=[
             *front_end.messages,
             *result.troubles,
@@ -391,12 +374,7 @@ def _conclude(
         ended=result.ended,
         fault=result.fault,
         intake=result.intake.as_dict(),
-        set_aside=result.set_aside,
-        skipped=result.skipped,
-        restarts=result.restarts,
-        recorded=result.recorded,
-        unrecorded=result.unrecorded,
-        tracking=result.tracking,
+        **{key: getattr(result, key) for key in AS_TOLD},
         feedforward=plan.feedforward,
     )
     learned = Learned(outcome, robot, reference, front_end, _accounts(result))

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from adapter.learning import schema_kernels as kernels
-from adapter.learning.frame_fit import Frame
-from adapter.learning.schema_check import Evidence, SchemaCheck
+from adapter.learning.frame_fit import Evidence, Frame, SchemaCheck
 from adapter.learning.settings import SchemaSettings
 from adapter.model.spatial import (
     Array,

@@ -176,9 +176,8 @@ class Theta:
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
         self.drums = np.array([x.drums(tree.slides) for x in self.effects]).reshape(e, n)
-        nothing: Array = np.full((e, n), np.nan)
-        told = believed(known.effects, settings.effects, n)
-        self.believed = told or (nothing, nothing)
+        nothing: Array = np.full((2, e, n), np.nan)
+        self.believed = believed(known.effects, settings.effects, n) or tuple(nothing)
         self._set_prior(*self._neutral_prior())
         self.x, self.gradient = np.zeros((2, self.P))
         self.x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
@@ -189,10 +188,9 @@ class Theta:
         self._given = tuple(kernels.Given(base, tool, np.array([hand]), self.th))
         self._work = np.zeros(self.P), np.zeros(self.P)
         self.updates = 0
+        usual = REAL_MODEL_ERROR if self.effects else IDEAL_MODEL_ERROR
         error = self.settings.model_error
-        if error is None:
-            error = REAL_MODEL_ERROR if self.effects else IDEAL_MODEL_ERROR
-        self.model_variance = error**2
+        self.model_variance = (usual if error is None else error) ** 2
         self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
         self.rests = np.ones(n)
@@ -218,9 +216,8 @@ class Theta:
     def effect_columns(self, table: Array) -> Array:
         """(m, c, n) columns of the effects for states (m, size), or their `before_links`."""
         at = self.layout.signals(table, self.smoothing_s)
-        columns = [column for effect in self.effects for column in effect.basis(at)]
-        out = np.empty((len(table), len(columns), self.tree.n))
-        for k, column in enumerate(columns):
+        out = np.empty((len(table), self.columns, self.tree.n))
+        for k, column in enumerate(x for effect in self.effects for x in effect.basis(at)):
             out[:, k] = column
         return out
 
@@ -251,11 +248,9 @@ class Theta:
         """
         error = self._absorb(frames, table, self.moments, self.weight)
         if self.each_sample:
-            newest = self.newest
-            newest.A[:], newest.C[:] = 0.0, 0.0
-            self._absorb(
-                frames, table[-1:], kernels.Moments(newest.A, newest.C, *_NO_LEVEL, _NOTHING)
-            )
+            A, C = self.newest[:2]
+            A[:], C[:] = 0.0, 0.0
+            self._absorb(frames, table[-1:], kernels.Moments(A, C, *_NO_LEVEL, _NOTHING))
         self.count += self.weight * len(table)
         return error
 
@@ -340,11 +335,9 @@ class Theta:
             H, rhs = 1e-6 * self.prior, 1e-6 * self.prior_rhs
             prior = tuple(kernels.Prior(H, rhs, self._ranges, 1e-6))
         base = self.base_weights()
-        weighing = kernels.Weighing(
-            counts, self.noise_gain, floor, floor_count, least, base, self.share
-        )
+        weighing = counts, self.noise_gain, floor, floor_count, least, base, self.share
         out = *self._work, self.gradient
-        kernels.gradient(self.x, self._rows, data, prior, tuple(weighing), out)
+        kernels.gradient(self.x, self._rows, data, prior, weighing, out)
         return True
 
     def base_weights(self) -> Array:
@@ -498,17 +491,15 @@ class Theta:
         variance = diagonal[self._effects_from :].reshape(-1, n) / self.drums**2
         widest = np.array([effect.learned_std for effect in self.effects])
         values, free = self.effect_values / self.drums, np.isnan(self.believed[0])
-        shares = [
-            self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
-        ]
+        ends = zip(self.rows.share, self.rows.sizes, strict=True)
+        shares = [share[size - self.columns : size] for share, size in ends]
         first = [own.start for own in self.own]
         # whether an effect acts at all; of one that does not no data speak
         acting = np.add.reduceat(np.array(shares), first, axis=1).T > 0.0
+        told = zip(values, variance, free, acting, self.effect_spread, strict=True)
         found = [
             likely_spread(x[f & on], v[f & on], before) if (f & on).any() else before * f.any()
-            for x, v, f, on, before in zip(
-                values, variance, free, acting, self.effect_spread, strict=True
-            )
+            for x, v, f, on, before in told
         ]
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(self._effects_from, self.P)
@@ -757,9 +748,8 @@ class Theta:
         self.x[spare] = self.mean[spare] = self.mean[hand]
         kernels.values(self.mean, self.rows.steps, self.th)
         # columns of the hand are the spare body's from here on
-        for place, before in zip(
-            (self.rows.place, self.rows.base_place), self._places, strict=True
-        ):
+        places = self.rows.place, self.rows.base_place
+        for place, before in zip(places, self._places, strict=True):
             moved = (before >= hand.start) & (before < hand.stop)
             place[:] = np.where(moved, before + spare.start - hand.start, before)
         self.spare_in_use = True

@@ -99,15 +99,12 @@ def _change_words(change: Change) -> str:
         (a, b), centres = values["mass_kg"], values["com_m"]
         way = 1e3 * float(np.linalg.norm(centres[1] - centres[0]))
         sizes = [float(np.trace(tensor)) / 3.0 for tensor in values["inertia_kg_m2"]]
-        words = (
-            f"{a:.4g} -> {b:.4g} kg, centre moved by {way:.3g} mm, mean inertia "
-            f"{sizes[0]:.3g} -> {sizes[1]:.3g} kg m²"
-        )
+        words = f"{a:.4g} -> {b:.4g} kg, centre moved by {way:.3g} mm, mean inertia "
+        words += f"{sizes[0]:.3g} -> {sizes[1]:.3g} kg m²"
     else:
-        words = ", ".join(
-            f"{'' if key == GRAVITY else key + ' '}{_number(a)} -> {_number(b)} {change.units[key]}"
-            for key, (a, b) in values.items()
-        )
+        named = {key: "" if key == GRAVITY else f"{key} " for key in values}
+        told = {key: " -> ".join(map(_number, pair)) for key, pair in values.items()}
+        words = ", ".join(f"{named[key]}{told[key]} {change.units[key]}" for key in values)
     if change.shown >= 0.5:
         return words
     share = f"{100.0 * change.shown:.2g} % of it" if change.shown else "none of it"

@@ -18,7 +18,7 @@ from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
 from adapter.report.words import with_doubt
 from adapter.runs.fleet.arm import DAY_S, TIME, FleetArm, OfLog
-from adapter.runs.fleet.course import Drift, StandsOut
+from adapter.runs.fleet.course import Drift
 from adapter.runs.fleet.fleet import Fleet
 
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
@@ -84,15 +84,14 @@ def drift_words(drift: Drift) -> str:
 
 def standing_out_words(arm: FleetArm) -> Iterator[str]:
     """A sentence for each recording with parameters that the others do not have."""
-    names, by_log = called(arm), dict[int, list[StandsOut]]()
-    for one in arm.standing_out:
-        by_log.setdefault(one.number, []).append(one)
-    for number, several in sorted(by_log.items()):
-        told = [
-            f"{KNOWN[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
-            f"{KNOWN[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
-            for x in several
-        ]
+    names, by_log = called(arm), dict[int, list[str]]()
+    for x in arm.standing_out:
+        effect = KNOWN[x.effect]
+        by_log.setdefault(x.number, []).append(
+            f"{effect.title.lower()} of joint {x.joint} is {x.value:.3g} "
+            f"{effect.parameters[0].written} where {x.expected:.3g} was to be expected"
+        )
+    for number, told in sorted(by_log.items()):
         yield f"{names[number]} stands out: {'; '.join(told)}"
 
 
@@ -113,10 +112,8 @@ def sentences(arm: FleetArm) -> list[str]:
     used = [(x, name) for name, x in zip(names, arm.logs, strict=True) if x.used]
     if len(used) > 1:
         best, name = max(used, key=lambda one: one[0].worth)
-        found.append(
-            f"The motion of {name} would teach most if repeated: standard "
-            f"deviations would be {_less(best.worth)} less (geometric mean)"
-        )
+        less = f"deviations would be {_less(best.worth)} less (geometric mean)"
+        found.append(f"The motion of {name} would teach most if repeated: standard {less}")
     return found
 
 
@@ -216,10 +213,8 @@ def _parameters(arm: FleetArm) -> Table:
         mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
         values = [with_doubt(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
         rows.append([name, with_doubt(*mass), *values])
-    note = (
-        "A mass without a standard deviation is the documentation's: torques show it in sums only."
-    )
-    return Table(heads, rows, units, note)
+    note = "A mass without a standard deviation is the documentation's: torques show it in sums"
+    return Table(heads, rows, units, f"{note} only.")
 
 
 def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:

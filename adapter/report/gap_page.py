@@ -24,10 +24,8 @@ from adapter.report.words import NARROW, arrow, capital
 
 WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
-OURS = (  # how clauses begin that are words of ours, no names
-    *("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints"),
-    *(WORTH, "but "),
-)
+# How clauses begin that are words of ours, no names.
+OURS = ("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints")
 
 
 def render_gap_page(result: GapResult, folder: Path | None = None) -> str:
@@ -44,8 +42,9 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     shown = _tiles(result) if told else []
     correction, ratio = tables.correction_table(result), tables.correction_ratio(result)
     found = "what was found" if result.findings else ""
-    corrected = "the small correction of the inertias" if correction else ""
+    added = filter(None, (found, "the small correction of the inertias" if correction else ""))
     largest = 0.0 if ratio is None or not ratio.size else float(np.abs(ratio).max())
+    part = f"The largest part is {largest:.1f} times the deviation that was"
     more = len(result.recordings) - MOST_NAMED
     took = f"{result.wall_s:.1f} s" if result.wall_s > 0.0 else DASH
     return {
@@ -62,8 +61,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "contradictions": [capital(text) for text in result.contradictions],
         "told": told,
         "error_table": tables.error_table(result) if told else None,
-        "after_words": "with "
-        + (" and ".join(filter(None, (found, corrected))) or "nothing added"),
+        "after_words": f"with {' and '.join(added) or 'nothing added'}",
         "errors": error_panels(result) if told else [],
         "signatures": signature_panels(result),
         "marked": any(f.interval_s[0] > 0.0 or not f.lasting for f in result.findings),
@@ -73,9 +71,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "unexplained_panels": unexplained_panels(result),
         "unseen": tables.unseen_table(result),
         "correction": correction if told else None,
-        "correction_words": ""
-        if ratio is None or not told
-        else f"The largest part is {largest:.1f} times the deviation that was expected beforehand.",
+        "correction_words": "" if ratio is None or not told else f"{part} expected beforehand.",
         "checks": gap_checks(result),
         "steps": gap_steps(result, folder),
         "notes": result.notes,
@@ -96,7 +92,7 @@ def _headline(result: GapResult) -> list[str]:
         parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
         return parts
-    said = [capital(text) if text.startswith(OURS) else text for text in parts]
+    said = [capital(text) if text.startswith((*OURS, WORTH, "but ")) else text for text in parts]
     return [f"{tables.tied(text.replace(' -> ', ' → '))}." for text in said]
 
 
@@ -128,9 +124,8 @@ def _tiles(result: GapResult) -> list[Tile]:
         times = words.noise_times(result)
         fell = arrow(times[0][worst], times[1][worst], "×")
         level = f"noise {plain(noise[worst], 2)} {result.unit('N m', worst)}"
-        tiles.append(
-            Tile("In units of its noise", fell, tables.tied(f"joint {worst + 1}, {level}"))
-        )
+        said = tables.tied(f"joint {worst + 1}, {level}")
+        tiles.append(Tile("In units of its noise", fell, said))
     off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
     if off is not None and np.isfinite(off).any():
         j = int(np.nanargmax(off))

@@ -39,15 +39,13 @@ def finding_row(findings: Sequence[Finding]) -> dict[str, Any]:
         when = f"in {len({f.recording for f in ordered})} recordings"
     else:
         when = words.span(first) or "throughout"
+    lines = [[tied(line) for line in parameter_lines(f)] for f in ordered]
+    values = lines[0] if alone else []
     if in_matrix(ordered):
         values = [f"{_ranges(ordered)}; joint by joint below"]
-    elif alone:
-        values = [tied(line) for line in parameter_lines(first)]
-    else:
-        values = [
-            f"{f.recording or who(f.effect, f.joints)}: {', '.join(map(tied, parameter_lines(f)))}"
-            for f in ordered
-        ]
+    elif not alone:
+        owners = [f.recording or who(f.effect, f.joints) for f in ordered]
+        values = [f"{x}: {', '.join(own)}" for x, own in zip(owners, lines, strict=True)]
     evidence = sure if alone or least >= 0.999 else f"{sure} and more"
     row = {"what": capital(first.title), "where": who(first.effect, joints), "when": when}
     return {**row, "values": values, "evidence": evidence, "worth": _worth(ordered)}
@@ -68,9 +66,13 @@ def _ranges(findings: Sequence[Finding]) -> str:
     for key in findings[0].parameters:
         factor, unit = _unit(findings, key)
         values = [factor * float(f.parameters[key]) for f in findings]
-        low, high = plain(min(values), 2), plain(max(values), 2)
-        said.append(f"{key} = {low if low == high else f'{low} to {high}'} {unit}")
+        said.append(f"{key} = {_from_to(values)} {unit}")
     return tied(", ".join(said))
+
+
+def _from_to(values: Sequence[float]) -> str:
+    low, high = plain(min(values), 2), plain(max(values), 2)
+    return low if low == high else f"{low} to {high}"
 
 
 def _unit(findings: Sequence[Finding], key: str) -> tuple[float, str]:
@@ -99,10 +101,7 @@ def joint_matrix(result: GapResult) -> Table | None:
 def _worth(findings: Sequence[Finding]) -> str:
     sizes = [np.asarray(f.torque_rms_nm, dtype=float) for f in findings]
     most = [float(np.nanmax(x)) for x in sizes if np.isfinite(x).any()]
-    if not most:
-        return DASH
-    low, high = plain(min(most), 2), plain(max(most), 2)
-    return tied(f"{low} N m" if low == high else f"{low} to {high} N m")
+    return tied(f"{_from_to(most)} N m") if most else DASH
 
 
 def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
@@ -173,15 +172,10 @@ def correction_table(result: GapResult) -> Table | None:
         link, part = np.unravel_index(place, ratio.shape)
         if ratio[link, part] == 0.0:
             break
-        rows.append(
-            [
-                f"link {link + 1}",
-                PARAMETERS[part],
-                tied(f"{result.corrections[link, part]:+.2g} {UNITS[part]}"),
-                f"± {plain(result.corrections_prior[link, part], 2)} {UNITS[part]}",
-                tied(f"{ratio[link, part]:+.1f}"),
-            ]
-        )
+        by = tied(f"{result.corrections[link, part]:+.2g} {UNITS[part]}")
+        prior = f"± {plain(result.corrections_prior[link, part], 2)} {UNITS[part]}"
+        times = tied(f"{ratio[link, part]:+.1f}")
+        rows.append([f"link {link + 1}", PARAMETERS[part], by, prior, times])
     heads = ["Link", "Parameter", "Correction", "Expected", "In units of it"]
     return Table(heads, rows) if rows else None
 

@@ -79,14 +79,11 @@ def _tiles(gap: ServoGap) -> list[Tile]:
     j = int(np.argmax(gap.before))
     off = arrow(1e3 * gap.before[j], 1e3 * gap.after[j], "mrad")
     at_hand = arrow(1e3 * gap.hand_before[-1], 1e3 * gap.hand_after[-1], "mm")
-    numbers = sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay")
+    numbers = str(sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay"))
     late = [f for f in gap.findings if f.effect == "servo_delay"]
     told = f"commands act {1e3 * late[0].values[0]:.2f} ms late" if late else "no delay of commands"
-    return [
-        Tile("Numbers found", str(numbers), told),
-        Tile("Tracking error", off, f"joint {j + 1}, rms"),
-        Tile("At the hand", at_hand, gap.hand),
-    ]
+    tracking = Tile("Tracking error", off, f"joint {j + 1}, rms")
+    return [Tile("Numbers found", numbers, told), tracking, Tile("At the hand", at_hand, gap.hand)]
 
 
 def _found(gap: ServoGap) -> Table | None:
@@ -106,10 +103,9 @@ def _found(gap: ServoGap) -> Table | None:
 
 def _errors(gap: ServoGap) -> Table:
     hand = gap.hand_before, gap.hand_after
-    rows = [
-        [name, *(plain(1e3 * float(x[j]), 3) for x in (gap.before, gap.after, *hand))]
-        for j, name in enumerate(gap.joint_names)
-    ]
+    off = 1e3 * np.stack([gap.before, gap.after, *(x[:-1] for x in hand)], axis=1)
+    cells = ((plain(x, 3) for x in row) for row in off.tolist())
+    rows = [[name, *row] for name, row in zip(gap.joint_names, cells, strict=True)]
     rows.append(["all", DASH, DASH, *(plain(1e3 * x[-1], 3) for x in hand)])
     heads = ["Joint", "Before", "After", "Before", "After"]
     return Table(heads, rows, ["", "mrad", "mrad", "hand, mm", "hand, mm"])
@@ -118,10 +114,8 @@ def _errors(gap: ServoGap) -> Table:
 def _arms(numbers: Sequence[ServoNumber]) -> Table | None:
     """A row for each number, a column for each arm; those that differ stand out."""
     arms = list(dict.fromkeys(arm for number in numbers for arm in number.values))
-    rows = [
-        [capital(x.title), *(tied(x.cell(arm)) + " ◄" * (arm in x.odd) for arm in arms)]
-        for x in numbers
-    ]
+    told = ((x, [tied(x.cell(arm)) + " ◄" * (arm in x.odd) for arm in arms]) for x in numbers)
+    rows = [[capital(x.title), *cells] for x, cells in told]
     return Table(["Number", *arms], rows) if rows else None
 
 
@@ -151,14 +145,11 @@ def _checks(gap: ServoGap) -> list[Check]:
     lost = f"; {who('', gap.worse)}: not better" if gap.worse else ""
     checks = [Check(LOOK if gap.worse else GOOD, "On data not fitted", said + lost)]
     left = [j + 1 for j in _unexplained(gap)]
+    said = f"every joint is below a quarter of its error or below {CLOSE_MRAD:g} mrad"
     if left:
         said = f"{who('', left)}: more than a quarter of the error and {CLOSE_MRAD:g} mrad"
-        checks.append(
-            Check(LOOK, "What is left", f"{said} that no number of these servos explains")
-        )
-    else:
-        said = f"every joint is below a quarter of its error or below {CLOSE_MRAD:g} mrad"
-        checks.append(Check(GOOD, "What is left", said))
+        said += " that no number of these servos explains"
+    checks.append(Check(LOOK if left else GOOD, "What is left", said))
     if gap.scale_open:
         said = (
             f"{who('', gap.scale_open)}: the documented masses hardly load it: motion is "
@@ -176,25 +167,23 @@ def _steps(gap: ServoGap, model: str, servos: Path) -> list[Step]:
         steps.append(Step(why, command("gap", *gap.recordings, "--hold-out", "ANOTHER")))
     if gap.ground.root > gap.servos.ground.root == 0.0:
         steps.append(Step("Record a second motion that touches the table, or none that does"))
-    slow, fast = list[int](), list[int]()
-    for j in _unexplained(gap):
-        (slow if _share_slow(gap, j) > MOSTLY else fast).append(j + 1)
-    if slow:
-        why = "what is left is where it is slow: record slow ramps up and down, with stops"
-        steps.append(Step(f"{capital(who('', slow))}: {why}"))
-    if fast:
-        why = "what is left is where it is fast: record steps and quick motions of several sizes"
-        steps.append(Step(f"{capital(who('', fast))}: {why}"))
-    if gap.scale_open:
-        why = "move it with a known mass in the hand that the model has too"
-        steps.append(Step(f"{capital(who('', gap.scale_open))}: {why}"))
+    left = _unexplained(gap)
+    slow = [j + 1 for j in left if _share_slow(gap, j) > MOSTLY]
+    fast = [j + 1 for j in left if j + 1 not in slow]
+    rest = "what is left is where it is"
+    for joints, why in (
+        (slow, f"{rest} slow: record slow ramps up and down, with stops"),
+        (fast, f"{rest} fast: record steps and quick motions of several sizes"),
+        (gap.scale_open, "move it with a known mass in the hand that the model has too"),
+    ):
+        if joints:
+            steps.append(Step(f"{capital(who('', joints))}: {why}"))
     if not gap.servos.is_ideal:
         why = "Use it: an arm for MuJoCo that follows commands as this one does"
-        words = "export", model, "--servo", str(servos), "--mjcf", "arm.xml"
-        steps.append(Step(why, command(*words)))
+        own = "--servo", str(servos)
+        steps.append(Step(why, command("export", model, *own, "--mjcf", "arm.xml")))
         why = "See later what wears: only what has changed is named"
-        words = "gap", "LATER.mcap", "--robot", model, "--servo", str(servos)
-        steps.append(Step(why, command(*words)))
+        steps.append(Step(why, command("gap", "LATER.mcap", "--robot", model, *own)))
     return steps
 
 

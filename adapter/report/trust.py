@@ -92,10 +92,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
         return [f"The learned model predicts torque to {after} ({fall.seen})."]
     before = _all_joints(fall.before, fall.before_std)
     if not (fall.better or fall.worse):
-        return [
-            f"The learned model predicts torque as the documentation does: to {after}, the "
-            f"documentation to {before} ({fall.seen})."
-        ]
+        both = f"to {after}, the documentation to {before} ({fall.seen})"
+        return [f"The learned model predicts torque as the documentation does: {both}."]
     more = np.square(fall.after) - np.square(fall.before)
     j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
     first, last = (quantity(x[j], "N m", 2) for x in (fall.before, fall.after))
@@ -158,10 +156,8 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
     if not (figures.get("torques") or {}).get("judged", True):
         said.append("Too little moved to tell whether the torques are this arm's.")
     if new:
-        said.append(
-            f"Something new acts that the learned model does not hold: {new} "
-            f"disagreement{'' if new == 1 else 's'}."
-        )
+        many = f"{new} disagreement{'' if new == 1 else 's'}"
+        said.append(f"Something new acts that the learned model does not hold: {many}.")
     return said
 
 
@@ -228,9 +224,8 @@ def _left(data: RunData) -> Check | None:
     joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
     most = f"{'up to ' if len(which) > 1 else ''}{most}"
     why = "something acts that no learned effect explains"
-    return Check(
-        LOOK, LEFT, f"{said}; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}"
-    )
+    said += f"; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}"
+    return Check(LOOK, LEFT, said)
 
 
 def _parameters(data: RunData) -> Check | None:
@@ -240,10 +235,8 @@ def _parameters(data: RunData) -> Check | None:
         return Check(BAD, "Inertias and friction", said)
     rank, every = theta.get("base_parameters"), 10 * data.n
     alone = data.theta_shown > SHARE_ALONE
-    said = (
-        f"torques show {rank} combinations of {every} inertial parameters, "
-        f"{int(alone.sum())} of them on their own"
-    )
+    said = f"torques show {rank} combinations of {every} inertial parameters, "
+    said += f"{int(alone.sum())} of them on their own"
     at, goal = theta.get("converged_s"), f"{TORQUE_GOAL:g} × the error of batch least squares"
     if at is None:
         if not theta.get("settled", True):
