@@ -159,10 +159,7 @@ class ExternalWrench(TorqueEffect):
     name = "external_wrench"
     title = "external wrench"
     scope = FLANGE
-    parameters = (
-        *(Parameter(key, "N") for key in KEYS[:3]),
-        *(Parameter(key, "N m") for key in KEYS[3:]),
-    )
+    parameters = tuple(Parameter(key, "N" if key in KEYS[:3] else "N m") for key in KEYS)
     prior_std = (15.0, 15.0, 15.0, 2.0, 2.0, 2.0)
     inexact = 0.05
     phrase = Phrase(

@@ -131,12 +131,6 @@ def play(q, half, start, link):
         link[i] = q[i] + sign * (last - q[i])
 
 
-def _pushed(dq: Array) -> float:
-    """Which way a joint with velocities dq (m,) moves first, from -1 to 1; 0 where it rests."""
-    way = smooth_sign(dq)
-    return float(way[np.argmax(np.abs(way) > MOVES)])
-
-
 class Backlash(MotionEffect):
     """Play in the gear, of full width b, crossed at each reversal: the link lags the motor."""
 
@@ -164,12 +158,13 @@ class Backlash(MotionEffect):
         of the motor's measured acceleration is no torque. A reversal that was smoothed looks as if
         it came earlier.
         """
-        half, dq = 0.5 * float(values["b"]), motion.dq[:, joint]
+        half, way = 0.5 * float(values["b"]), smooth_sign(motion.dq[:, joint])
         angles = motion.q if motion.sharp_q is None else motion.sharp_q
         q = np.ascontiguousarray(angles[:, joint])
-        link = q - half * smooth_sign(dq)
+        link = q - half * way
         if not motion.apart:
-            play(q, half, q[0] - half * _pushed(dq), link)
+            pushed = float(way[np.argmax(np.abs(way) > MOVES)])  # from -1 to 1; 0 where it rests
+            play(q, half, q[0] - half * pushed, link)
         behind = motion.as_smooth(link - q)
         rate = motion.rate(behind)
         return motion.moved(joint, behind, rate, motion.rate(rate))

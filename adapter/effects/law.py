@@ -368,9 +368,7 @@ class Curve(OverSignals):
         return np.asarray(WEIGHTS[self.weight](at) * np.sum(basis * x, axis=0))
 
 
-CURVES: dict[str, Curve] = {
-    curve.name: curve
-    for curve in (*map(Curve, SIGNALS), Curve("q", "sign(dq) "), Curve("q", "dq "))
-}
+OVER_Q = Curve("q", "sign(dq) "), Curve("q", "dq ")
+CURVES: dict[str, Curve] = {curve.name: curve for curve in (*map(Curve, SIGNALS), *OVER_Q)}
 LAWS: dict[str, Law] = {law.name: law for x in _grammar() for law in _laws_of(x)}
 EXPRESSIONS = tuple(dict.fromkeys(law.expression.text for law in LAWS.values()))

@@ -98,10 +98,8 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     if int(arrays.get("version", -1)) != VERSION:
         raise SettingsError(f"{path}: not a checkpoint of version {VERSION}")
     if str(arrays.get("about")) != _about(learner):
-        raise SettingsError(
-            f"{path}: is of another robot or other learner settings: {arrays.get('about')}; "
-            f"here: {_about(learner)}"
-        )
+        both = f"{arrays.get('about')}; here: {_about(learner)}"
+        raise SettingsError(f"{path}: is of another robot or other learner settings: {both}")
     lacking = [key for key in (*_NEEDED, *_FINITE) if key not in arrays]
     if lacking:
         raise SettingsError(f"{path}: the checkpoint lacks '{lacking[0]}'")

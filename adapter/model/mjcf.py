@@ -184,9 +184,8 @@ class MjcfFile:
             links[joint.child] = self._theta(i)
             joints[joint.name] = joint
         name = self.compiled.names.split(b"\0")[0].decode() or self.path.stem
-        return FileRobot(
-            str(self.path), name, links, joints, Source(MJCF, str(self.path.resolve()))
-        )
+        source = Source(MJCF, str(self.path.resolve()))
+        return FileRobot(str(self.path), name, links, joints, source)
 
     def extras(self, name: str) -> dict[str, float]:
         """What a joint has beside the rigid arm, by MuJoCo's names; zeros left out."""

@@ -25,12 +25,8 @@ from adapter.model.urdf_text import (
 )
 
 # MuJoCo's names of what a joint has: <joint damping=... frictionloss=... armature=...>.
-MJCF_PLACES = {
-    DAMPING: "damping",
-    FRICTION: "frictionloss",
-    ARMATURE: "armature",
-    STIFFNESS: "stiffness",
-}
+MJCF_PLACES = {DAMPING: "damping", FRICTION: "frictionloss", ARMATURE: "armature"}
+MJCF_PLACES[STIFFNESS] = "stiffness"
 WORLD = "world"  # MuJoCo's name for what does not move; no body may have it
 
 

@@ -80,9 +80,6 @@ class RecordingClock:
 
     def words(self) -> list[str]:
         """What is worth knowing, a sentence each; a recording without fault has none."""
-        return [*self._words_on_stamps(), *self._words_on_rows(), *self._words_on_signals()]
-
-    def _words_on_stamps(self) -> list[str]:
         said = []
         if self.out_of_order:
             said.append(f"{self.out_of_order} stamps do not increase; those samples are left out.")
@@ -94,14 +91,8 @@ class RecordingClock:
                 f"longest is {1e3 * length:.3g} ms at {start:.2f} s."
             )
         if self.jitter_s > 0.1 * self.period_s:
-            said.append(
-                f"The steps between stamps scatter by {1e3 * self.jitter_s:.2g} ms around "
-                f"{1e3 * self.period_s:.3g} ms."
-            )
-        return said
-
-    def _words_on_rows(self) -> list[str]:
-        said = []
+            around = f"{1e3 * self.jitter_s:.2g} ms around {1e3 * self.period_s:.3g} ms"
+            said.append(f"The steps between stamps scatter by {around}.")
         if self.not_finite:
             said.append(f"{self.not_finite} samples hold no number; they are left out.")
         if self.impossible:
@@ -110,17 +101,15 @@ class RecordingClock:
                 "zero, single readings far from those before and after); they are left out."
             )
         if self.repeated > 0.001:
-            said.append(
-                f"{100 * self.repeated:.1f} % of the samples repeat the one before; they are "
-                "left out."
-            )
+            share = f"{100 * self.repeated:.1f} %"
+            said.append(f"{share} of the samples repeat the one before; they are left out.")
         if self.frozen:
             start, length = max(self.frozen, key=lambda run: run[1])
             said.append(
                 f"The signals stand still while the arm moves, {len(self.frozen)} times, longest "
                 f"for {1e3 * length:.3g} ms at {start:.2f} s."
             )
-        return said
+        return [*said, *self._words_on_signals()]
 
     def _words_on_signals(self) -> list[str]:
         said = []
@@ -147,9 +136,8 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
         begins_s: when each piece begins, since the recording began.
     """
     samples = np.array([c.samples for c in clocks], dtype=float)
-    late, std = (
-        np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s")
-    )
+    own = ("lateness_s", "lateness_std_s")
+    late, std = (np.array([getattr(c, key) for c in clocks]) for key in own)
     told = np.isfinite(late) & np.isfinite(std)
     weight = np.maximum(std[told], 1e-6) ** -2.0  # of a lateness; no clock is better
     gains = np.array([c.velocity_gain for c in clocks])
@@ -461,7 +449,6 @@ def source_stamps(stamp_ns: Index, q: Array, dq: Array) -> Index:
     numbers = np.concatenate([[0.0], np.cumsum(ticks)])
     span_ns = float(stamp_ns[-1] - stamp_ns[0])
     even = stamp_ns[0] + np.round(numbers * (span_ns / numbers[-1])).astype(np.int64)
-    before, after = (
-        float(np.sum((went - 1e-9 * np.diff(x)[:, None] * speed) ** 2)) for x in (stamp_ns, even)
-    )
+    apart = (went - 1e-9 * np.diff(x)[:, None] * speed for x in (stamp_ns, even))
+    before, after = (float(np.sum(x**2)) for x in apart)
     return even if after < BETTER * before else stamp_ns

@@ -162,10 +162,8 @@ def recording_log(spec: source_signals.ImportSpec) -> mcap.Log:
     if "time" in spec.units:
         given.append("units time")
     if given:
-        raise DriverError(
-            f"{path}: is a recording, whose messages have names and stamps; "
-            f"--{given[0].removesuffix('_s')} goes with tables"
-        )
+        said = f"--{given[0].removesuffix('_s')} goes with tables"
+        raise DriverError(f"{path}: is a recording, whose messages have names and stamps; {said}")
     factors = {name: source_signals.unit_factor(spec.units, name) for name in ("q", "dq", "tau")}
     found = mcap.read_position_log(path, spec.topic)
     signals = ("q", "dq", "tau") if found is None else ("q",)
@@ -299,7 +297,5 @@ def velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array
     ratio = said / slope if slope > _MOVING and said > 0 else 1.0
     if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
         return []
-    return [
-        f"{where}: velocities are {ratio:.3g} times the slope of the positions; are the units "
-        "of q, dq and time right?"
-    ]
+    said = "the slope of the positions; are the units of q, dq and time right?"
+    return [f"{where}: velocities are {ratio:.3g} times {said}"]

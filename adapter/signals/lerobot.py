@@ -51,9 +51,8 @@ def write_lerobot(path: Path, folder: Path) -> list[str]:
     counted = {"frame_index": np.arange(rows), "index": np.arange(rows)}
     counted |= {key: np.zeros(rows, dtype=np.int64) for key in ("episode_index", "task_index")}
     single: dict[str, NDArray[Any]] = {"timestamp": since_s.astype(np.float32), **counted}
-    features: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": [n], "names": names} for key in told
-    }
+    wide = {"dtype": "float32", "shape": [n], "names": names}
+    features: dict[str, Any] = {key: dict(wide) for key in told}
     for key, x in single.items():
         features[key] = {"dtype": str(x.dtype), "shape": [1], "names": None}
     flat = {key: pa.array(x.astype(np.float32).ravel()) for key, x in told.items()}

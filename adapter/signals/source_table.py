@@ -83,10 +83,8 @@ class SourceTable:
         else:
             return self._named(selector, what)
         if not first < last <= count:
-            raise DriverError(
-                f"{self.path}: column {selector} for {what} isn't there; it has {count} columns, "
-                f"0 to {count - 1}{self._having()}"
-            )
+            has = f"it has {count} columns, 0 to {count - 1}{self._having()}"
+            raise DriverError(f"{self.path}: column {selector} for {what} isn't there; {has}")
         return list(range(first, last))
 
     def _named(self, selector: str, what: str) -> list[int]:

@@ -288,9 +288,8 @@ def _of_logs(
         worth = 0.5 * float(np.linalg.slogdet(more)[1] - before) / len(known)
         effects, std = _own_effects(theta, information, side, rmse)
         carried = None if load is None else Load(float(load[0][0]), load[1])
-        told.append(
-            OfLog(log, log.content in among, carried, effects, std, rmse, own_rmse, (), worth)
-        )
+        own = carried, effects, std, rmse, own_rmse
+        told.append(OfLog(log, log.content in among, *own, (), worth))
     usual = np.median([x.rmse for x in told if x.used], axis=0)
     few = len(told) < FEWEST_TO_COMPARE
     out = [x if few else replace(x, disagrees=_worse(x, usual, len(told))) for x in told]

@@ -98,10 +98,10 @@ def courses(
     """
     use = [np.isfinite(x.values) & (x.std > 0.0) for x in series]
     drifts = _drifts(series, columns, use)
-    follows = [
-        [columns[x.follows] for x in drifts if (x.effect, x.joint) == (one.effect, one.joint)]
-        for one in series
-    ]
+    by: dict[tuple[str, int], list[Array]] = {}
+    for x in drifts:
+        by.setdefault((x.effect, x.joint), []).append(columns[x.follows])
+    follows = [by.get((one.effect, one.joint), []) for one in series]
     out: list[StandsOut] = []
     while farthest := list(_standing_out(series, follows, use)):
         for k, found in farthest:  # another one may have hidden behind it
@@ -128,11 +128,10 @@ def _drifts(series: Sequence[Series], columns: Mapping[str, Array], use: Used) -
                 mean = float(np.average(one.values[ours], weights=one.std[ours] ** -2.0))
                 drift = Drift(one.effect, one.joint, name, slope, std, span, mean, chance)
                 own.append(drift)
-    apart = (
-        _told_apart(one, sorted(own, key=lambda x: x.chance), columns, ours)
-        for one, own, ours in zip(series, found, use, strict=True)
-    )
-    return sorted((x for several in apart for x in several), key=lambda x: (x.chance, -x.span))
+    apart: list[Drift] = []
+    for one, own, ours in zip(series, found, use, strict=True):
+        apart += _told_apart(one, sorted(own, key=lambda x: x.chance), columns, ours)
+    return sorted(apart, key=lambda x: (x.chance, -x.span))
 
 
 def _told_apart(

@@ -143,10 +143,8 @@ def read_manifest(path: Path) -> Manifest:
         columns = list(reader.fieldnames or ())
         key = next((x for x in columns if x.strip().lower() in LOG_COLUMNS), None)
         if key is None:
-            raise SettingsError(
-                f"{path}: needs a column named one of {', '.join(LOG_COLUMNS)}; has: "
-                f"{', '.join(columns) or 'nothing'}"
-            )
+            has = f"{', '.join(LOG_COLUMNS)}; has: {', '.join(columns) or 'nothing'}"
+            raise SettingsError(f"{path}: needs a column named one of {has}")
         arms: dict[str, str] = {}
         told: dict[str, dict[str, float]] = {}
         for number, row in enumerate(reader, start=2):
