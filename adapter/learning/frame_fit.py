@@ -201,13 +201,6 @@ def curvature_in_parent(sums: Array, weights: Array, frame: Frame) -> tuple[Arra
     return values, vectors
 
 
-def hidden_freedom(sums: Array, weights: Array, frame: Frame, least: float) -> Freedom:
-    """What moments do not show of a frame: all whose curvature is not above `least`."""
-    values, vectors = curvature_in_parent(sums, weights, frame)
-    hidden = vectors[:, values <= least]
-    return Freedom.of((hidden @ hidden.T)[None], frame.p[None])
-
-
 def nearest(sums: Array, weights: Array, frame: Frame, to: Frame, freedom: Freedom) -> Frame:
     """Of the frames that explain the data as this one does, the nearest to another.
 
@@ -299,6 +292,8 @@ class SchemaCheck:
         if log_misfit(sums, count, found) > misfit - CLEARLY_BETTER:
             return None
         weights = profiled_weights(sums, count, found)
-        freedom = hidden_freedom(known.clean, weights, found, known.least)
+        values, vectors = curvature_in_parent(known.clean, weights, found)
+        hidden = vectors[:, values <= known.least]  # what the data do not show
+        freedom = Freedom.of((hidden @ hidden.T)[None], found.p[None])
         held = nearest(sums, weights, found, start, freedom)
         return held if log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else found

@@ -150,9 +150,8 @@ def signature_panels(result: GapResult) -> list[dict[str, Any]]:
             laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
             for finding in laws:
                 _law(cloud.axes[0], finding)
-            clouds.append(
-                cloud.panel(title, result.unit("N m", j), ", ".join(f.title for f in laws))
-            )
+            called = ", ".join(f.title for f in laws)
+            clouds.append(cloud.panel(title, result.unit("N m", j), called))
         why = [result.joint_names[j]]
         said = [
             f.title for f in result.findings if j + 1 in f.joints or _worst(f.torque_rms_nm) == j
@@ -285,9 +284,8 @@ def _motion(result: GapResult, j: int) -> Panel:
     for left, color in ((curves.before, GOAL), (curves.after, ACCENT)):
         ax.plot(*_line(curves.t, tau - left[:, j]), color=color, linewidth=0.9)
     time_axis(drawing, "time, s")
-    return drawing.panel(
-        "Torque, measured and predicted", result.unit("N m", j), f"of {curves.recording}"
-    )
+    unit, note = result.unit("N m", j), f"of {curves.recording}"
+    return drawing.panel("Torque, measured and predicted", unit, note)
 
 
 def rollout_drawing(rollout: RolloutCurves, j: int, start: float, stop: float) -> Drawing:

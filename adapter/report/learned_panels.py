@@ -171,14 +171,10 @@ def body_panels(data: RunData) -> list[Panel]:
         for ax, (unit, parts) in zip(drawing.axes, GROUPS, strict=True):
             for k in parts:
                 alone = data.theta_shown[j, k] > SHARE_ALONE
-                ax.plot(
-                    t,
-                    theta[:, j, k],
-                    color=joint_color(COLOR_OF[k]),
-                    linewidth=1.3 if alone else 0.7,
-                    alpha=1.0 if alone else 0.6,
-                    gid=named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})"),
-                )
+                width, alpha = (1.3, 1.0) if alone else (0.7, 0.6)
+                name = named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})")
+                color = joint_color(COLOR_OF[k])
+                ax.plot(t, theta[:, j, k], color=color, linewidth=width, alpha=alpha, gid=name)
             ax.set_ylabel(unit, color=MUTED, fontsize=SIZES["quarter"][2], labelpad=1.0)
             ax.yaxis.set_major_locator(MaxNLocator(3))
         drawing.figure.subplots_adjust(left=0.21, hspace=0.1)
@@ -236,12 +232,9 @@ def error_panel(data: RunData) -> Panel:
         ax.set_ylim(0.0, max(SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()), 1.5 * usual))
     _finish(drawing, t, data)
     mark(ax, data.converged_s("theta"), f"inside {TORQUE_GOAL:g} × batch", top=0.88)
-    return drawing.panel(
-        "Prequential torque error",
-        "in units of the noise",
-        f"rms over {TORQUE_WINDOW_S:g} s and all joints; each sample is predicted first, "
-        "then learned from",
-    )
+    note = f"rms over {TORQUE_WINDOW_S:g} s and all joints; each sample is predicted first, then "
+    note += "learned from"
+    return drawing.panel("Prequential torque error", "in units of the noise", note)
 
 
 def error_by_joint(data: RunData) -> Panel:
