@@ -116,9 +116,8 @@ def single_thread_learner(
     learner = make_learner(documented, settings)
     delay_s = make_front_end(documented, settings).delay_s
     tool = None if documented.tool is None else documented.tool.theta()
-    found, doubt = (
-        partial(tell, label) if aloud else keep_quiet for label in (DISAGREEMENT, "warning")
-    )
+    labels = (DISAGREEMENT, "warning")
+    found, doubt = (partial(tell, label) if aloud else keep_quiet for label in labels)
     learner.watch = Monitor(documented.tree.n, tool, delay_s, found)
     learner.screen = LiveScreen(documented, doubt, trusted)
     if resume is not None:

@@ -304,15 +304,9 @@ def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
         for j in range(n):
             value, shape = float(outcome.effects[k, j]), float(outcome.shapes[k, j])
             name, parameters = effect.learned_as(value, shape)
-            entries.append(
-                {
-                    "effect": name,
-                    "joints": [j + 1],
-                    "parameters": parameters,
-                    "std": {effect.key: float(outcome.effects_std[k, j])},
-                    "units": KNOWN[name].units(tree.slides[j]),
-                }
-            )
+            entry = {"effect": name, "joints": [j + 1], "parameters": parameters}
+            entry["std"] = {effect.key: float(outcome.effects_std[k, j])}
+            entries.append({**entry, "units": KNOWN[name].units(tree.slides[j])})
     return entries
 
 

@@ -177,9 +177,8 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
         SettingsError: the model's base floats.
     """
     if documented.tree.floating:
-        raise SettingsError(
-            f"a fleet is of arms whose base stands; that of {documented.name} floats"
-        )
+        said = f"that of {documented.name} floats"
+        raise SettingsError(f"a fleet is of arms whose base stands; {said}")
     model = model_file.dumps(documented)
     store = _store(documented, settings)
     tasks = [Task(path, model, settings.topic, settings.told) for path in dict.fromkeys(given)]
