@@ -61,17 +61,6 @@ def test_a_single_file_under_a_hostile_name_and_packed(tmp_path):
         assert log.path == tmp_path / name
 
 
-def test_several_topics_are_named_and_one_is_chosen(tmp_path):
-    left, right = Motion.of(seed=2), Motion.of(seed=3)
-    topics = {"/left/state": (JOINT_STATE, left), "/right/state": (KINDS[1], right)}
-    path = write_ros2(tmp_path / "bag", topics)
-    with pytest.raises(DriverError, match=r"2 topics .*: /left/state, /right/state; .*--topic"):
-        read_log(path)
-    equal(read_log(path, topic="/right/state"), right)
-    with pytest.raises(DriverError, match=r"no message on /middle; found: .*/left/state"):
-        read_log(path, topic="/middle")
-
-
 def test_the_usual_topic_comes_first_where_it_tells_efforts_and_the_others_are_named(tmp_path):
     both = {"/joint_states": (JOINT_STATE, Motion.of()), "/other": (JOINT_STATE, Motion.of(seed=4))}
     path = write_ros2(tmp_path / "a", both)

@@ -65,12 +65,6 @@ def test_usual_names_need_no_map(tmp_path, header):
     assert_same(log)
 
 
-def test_decimal_commas(tmp_path):
-    table = write(tmp_path / "t.csv", TABLE, ";")
-    table.write_text(table.read_text().replace(".", ","))
-    assert_same(run(tmp_path, [table], COLUMNS)[0])
-
-
 @pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_units(tmp_path, unit, scale):
     factors = np.array([scale] + 4 * [180 / np.pi] + 2 * [1e3])
@@ -139,23 +133,6 @@ def test_lengths_that_do_not_fit(tmp_path):
         run(tmp_path, [f"time={time}", f"q={q}"])
     with pytest.raises(DriverError, match=r"nowhere\.txt: cannot be read: No such file"):
         run(tmp_path, [tmp_path / "nowhere.txt"])
-
-
-def test_doubts_are_said(tmp_path):
-    spoiled = TABLE.copy()
-    spoiled[5, 6] = np.nan
-    spoiled[10, 0] -= 0.1
-    table = write(tmp_path / "t.csv", spoiled * np.array([1e3, 2000, 2000, 100, 100, 1, 1]))
-    spec = ImportSpec.from_options([str(table)], COLUMNS, "time=s,q=rad")
-    said = "\n".join(import_file(spec, tmp_path / "out.mcap").warnings)
-    for doubt in (
-        "time runs backwards 1 times, first at sample 10",
-        "samples are 1 s apart; is the time in s?",
-        "tau is not a number in 1 samples, first in sample 5",
-        "are they degrees? Say q=deg",
-        "times the slope of the positions",
-    ):
-        assert doubt in said, doubt
 
 
 def test_describe(tmp_path):

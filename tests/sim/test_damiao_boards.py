@@ -417,15 +417,6 @@ def serving(boards: Boards):
     assert not thread.is_alive()
 
 
-def test_served_in_a_thread_until_told_to_stop() -> None:
-    with two_buses("thread") as (near, far):
-        boards = Boards(far, build("nominal"), LIMP)
-        with serving(boards):
-            near.send(frame(0x7FF, refresh(2)))
-            assert receive(near, 0x12) is not None
-        boards.close()
-
-
 def multicast_or_skip(channel: str, port: int) -> can.BusABC:
     try:
         return can.Bus(interface="udp_multicast", channel=channel, port=port, hop_limit=0)
