@@ -112,14 +112,6 @@ def test_lambda_follows_and_its_spread_is_what_it_is_off_by() -> None:
     assert 0.7 < np.sqrt(np.mean((off / learned.schema.std[shown]) ** 2)) < 1.4
 
 
-def test_positions_and_twists_alone_serve() -> None:
-    case = _case("panda", SHORT, 0)
-    nothing = np.full_like(case.log.q, np.nan)
-    bare = discover(replace(case.log, dq=nothing, tau=nothing, accels=None))
-    assert bare.log.tau is None and bare.log.measured == ("w", "v")
-    assert {(e.joint, e.link, e.parent) for e in bare.edges} == case.edges
-
-
 def _chain(case: Case) -> np.ndarray:
     """Recorded link names of the Panda from the base on."""
     children = {parent: link for _, link, parent in case.edges}

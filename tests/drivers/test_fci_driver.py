@@ -541,25 +541,6 @@ def test_commands_wait_until_the_modes_show_the_motion(peer5, connected):
     assert [message_id for message_id, _, _ in peer5.commands] == [base + 6]
 
 
-def test_torques_and_steps_are_cut_at_the_robots_limits(peer, connected):
-    arm = connected(peer, allow_motion=True)
-    wanted = np.array([1e3, -1e3] * 3 + [1e3])
-    limits = [87, 87, 87, 87, 12, 12, 12]
-
-    def all_reached():
-        return bool(peer.commands) and np.allclose(np.abs(peer.commands[-1][1]), limits)
-
-    drive(arm, all_reached, wanted)
-    torques = np.array([tau for _, tau, _ in peer.commands])
-    assert np.abs(np.diff(torques, axis=0, prepend=0.0)).max() <= 1.0
-    assert np.allclose(np.abs(torques).max(axis=0), limits)
-    before = len(peer.commands)
-    arm.stop()
-    after = np.array([tau for _, tau, _ in peer.commands[before:]])
-    assert np.isfinite(after).all()
-    assert np.abs(np.diff(after, axis=0)).max() <= 1.0
-
-
 @pytest.mark.parametrize(("first", "sign"), [(True, 1.0), (False, 1.0), (True, -1.0)])
 def test_a_command_answers_the_newest_state_with_what_was_accepted_there(
     peer5, connected, first, sign

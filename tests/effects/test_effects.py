@@ -69,12 +69,6 @@ def on_joint(torque: np.ndarray, joint: int = J) -> np.ndarray:
     return out
 
 
-def test_the_rigid_arm_is_pinocchios() -> None:
-    assert relative(ARM.torque(Q, DQ, DDQ), RIGID) < 1e-9
-    assert relative(ARM.regressor(Q, DQ, DDQ) @ ARM.theta.ravel(), RIGID) < 1e-9
-    assert relative(sensed(), RIGID) < 1e-9
-
-
 AT_JOINT = {
     "viscous_friction": ({"Fv": 0.4}, 0.4 * DQ[:, J]),
     "coulomb_friction": ({"Fc": 0.7}, 0.7 * SIGN),

@@ -41,12 +41,7 @@ from adapter.experiments.baselines.paper import (
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
-from adapter.physics.networks import (
-    DTYPE,
-    FrameMotion,
-    inverse_dynamics,
-    theta_from_log_cholesky,
-)
+from adapter.physics.networks import DTYPE, FrameMotion, inverse_dynamics, theta_from_log_cholesky
 from tests.helpers.arm_data import free_answers, pin_tree
 from tests.helpers.robot_models import relative
 

@@ -20,13 +20,7 @@ from adapter.effects.base import LINK, Motion
 from adapter.effects.bodies import theta_of
 from adapter.effects.by_joint import AT_REST
 from adapter.effects.torque import sensed_torque
-from adapter.gap.candidates import (
-    Candidate,
-    log_odds,
-    patterns,
-    signatures,
-    stages_of,
-)
+from adapter.gap.candidates import Candidate, log_odds, patterns, signatures, stages_of
 from adapter.gap.evidence import LEAST_NM, Carried, noise_of, score
 from adapter.gap.findings import parameter_std
 from adapter.gap.fit import (

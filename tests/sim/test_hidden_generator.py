@@ -241,41 +241,25 @@ def test_judge_compares_with_the_oracle_on_another_motion(tmp_path):
     assert torque_judge(trial, recording, {"findings": []}, tmp_path) == {}
 
 
+def told(effect, joints=(), interval_s=None, **parameters):
+    entry = {"effect": effect, "joints": list(joints), "parameters": parameters}
+    return {**entry, "interval_s": interval_s, "evidence": 0.97}
+
+
 def test_scorer_tells_right_from_wrong():
-    truth = {
-        "seed": 0,
-        "kind": "single",
-        "effects": [
-            {
-                "effect": "payload",
-                "joints": [],
-                "interval_s": [7.0, None],
-                "parameters": {"m": 1.0, "cx": 0.0, "cy": 0.0, "cz": 0.2},
-            }
-        ],
-    }
-    right = {
-        "effect": "payload",
-        "joints": [],
-        "interval_s": [7.2, None],
-        "parameters": {"m": 1.05, "cx": 0.01, "cy": 0.0, "cz": 0.2},
-        "evidence": 0.99,
-    }
+    load = told("payload", (), [7.0, None], m=1.0, cx=0.0, cy=0.0, cz=0.2)
+    truth = {"seed": 0, "kind": "single", "effects": [load]}
+    right = told("payload", (), [7.2, None], m=1.05, cx=0.01, cy=0.0, cz=0.2)
     row = score_trial({"findings": [right]}, truth, [50.0])
     assert row["exact"] and row["parameters"] == [True] and np.isclose(row["date_errors_s"][0], 0.2)
     heavy = {**right, "parameters": {**right["parameters"], "m": 1.3}, "std": {"m": 0.05}}
     assert score_trial({"findings": [heavy]}, truth, [50.0])["parameters"] == [False]
-    body = {"effect": "link_inertia", "joints": [7], "parameters": {}, "evidence": 0.95}
+    body = told("link_inertia", [7])
     assert score_trial({"findings": [body]}, truth, [50.0])["wrong"] == ["link_inertia"]
     listed = {**body, "ambiguous_with": ["payload"]}
     row = score_trial({"findings": [listed]}, truth, [50.0])
     assert row["named"] == 1 and not row["exact"] and not row["wrong"]
-    extra = {
-        "effect": "coulomb_friction",
-        "joints": [2],
-        "parameters": {"Fc": 1.0},
-        "evidence": 0.97,
-    }
+    extra = told("coulomb_friction", [2], Fc=1.0)
     row = score_trial({"findings": [right, extra]}, truth, [50.0])
     assert not row["exact"] and row["sure_wrong"] == 1
     outside = {**truth, "kind": "outside"}

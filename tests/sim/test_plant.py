@@ -20,6 +20,7 @@ from sim.scenarios import build
 from sim.truth import panda, turn
 from tests.helpers.arm_data import pin_model, pin_tree, rms, rnea
 from tests.helpers.random_trees import random_tree
+from tests.helpers.robot_models import frame_motion
 
 
 def oracle_motion(truth, q, dq, ddq):
@@ -29,16 +30,10 @@ def oracle_motion(truth, q, dq, ddq):
 
 
 def motion_of(model, q, dq, ddq, joints):
-    data = model.createData()
+    data, g = model.createData(), model.gravity.linear
     pin.forwardKinematics(model, data, q, dq, ddq)
-    twist, accel = [], []
-    for j in joints:
-        v = pin.getVelocity(model, data, j, pin.LOCAL)
-        a = pin.getClassicalAcceleration(model, data, j, pin.LOCAL)
-        felt = a.linear - data.oMi[j].rotation.T @ model.gravity.linear
-        twist.append(v.vector)
-        accel.append(np.concatenate([felt, a.angular]))
-    return np.array(twist), np.array(accel)
+    rows = np.array([frame_motion(model, data, j, np.eye(3), g).ravel() for j in joints])
+    return rows[:, :6], rows[:, 6:]
 
 
 @pytest.mark.parametrize("links", [5, 12, 40])
