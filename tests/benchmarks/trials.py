@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ from adapter.runs.score import reference_from, schema_score, theta_score
 from adapter.signals.records import stamp_of
 from drivers.interface import Driver
 from sim.scenarios import Scenario, build
-from tests.helpers.benchmark import Row, options, told, write
+from tests.helpers.benchmark import Row, options, shown, told, write
 
 LATE_S, END_S = 15.0, 30.0
 
@@ -317,12 +316,6 @@ TRIALS: dict[str, tuple[Callable[[Any], Row], list[Any]]] = {
 }
 
 
-def shown(name: str, row: Row) -> str:
-    """A line of a trial."""
-    parts = (f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items())
-    return " ".join([name, *parts])
-
-
 def main() -> None:
     """Run the trials that were asked for."""
     parser = options(__doc__, workers=2)
@@ -338,7 +331,10 @@ def main() -> None:
         for name in chosen:
             trial, jobs = TRIALS[name]
             began = time.monotonic()
-            found[name] = told(pool.map(trial, jobs[: args.seeds]), line=partial(shown, name))
+            found[name] = told(
+                pool.map(trial, jobs[: args.seeds]),
+                line=lambda row, name=name: f"{name} {shown(row)}",
+            )
             spent_s = time.monotonic() - began
             print(f"{name}: {len(found[name])} trials in {spent_s:.0f} s", flush=True)
     write(args.json, json.loads(json.dumps(found, default=float)))

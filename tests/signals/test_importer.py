@@ -10,8 +10,8 @@ from adapter.signals.recording import describe
 from adapter.signals.source_signals import ImportSpec
 from drivers.files.mcap import read_log
 from drivers.interface import DriverError
+from tests.helpers.robot_models import shared
 
-SHARED = Path(__file__).parents[2].parent / "shared"
 ROWS = 400
 RNG = np.random.default_rng(3)
 TIME = 2.0 + np.arange(ROWS) * 1e-3
@@ -152,9 +152,8 @@ def test_describe(tmp_path):
     assert not facts["truncated"]
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the folder of real logs is not beside the project")
 def test_the_real_panda_log(tmp_path):
-    folder = SHARED / "data/panda_gaz2019"
+    folder = shared("data/panda_gaz2019")
     files = {"time": "time", "q": "positions", "dq": "velocity", "tau": "torques"}
     sources = [f"{s}={folder}/exciting_traj_{name}.txt" for s, name in files.items()]
     log, report = run(tmp_path, sources, joint_names=tuple(f"panda_joint{i}" for i in range(1, 8)))
@@ -166,10 +165,9 @@ def test_the_real_panda_log(tmp_path):
     assert facts["period_ms"]["max"] == pytest.approx(8.81, abs=0.01)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the folder of real logs is not beside the project")
 def test_the_real_lwr_log(tmp_path):
     names = tuple(f"lwr_{i}_joint" for i in range(7))
-    log, report = run(tmp_path, [SHARED / "data/lwr4/measurements_1.npz"], joint_names=names)
+    log, report = run(tmp_path, [shared("data/lwr4/measurements_1.npz")], joint_names=names)
     assert len(log) == 5027
     assert ["cmd=target_positions" in said for said in report.warnings] == [True]
     assert report.rate_hz == pytest.approx(200, rel=1e-3)
