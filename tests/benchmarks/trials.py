@@ -37,7 +37,7 @@ from adapter.runs.score import reference_from, schema_score, theta_score
 from adapter.signals.records import stamp_of
 from drivers.interface import Driver
 from sim.scenarios import Scenario, build
-from tests.helpers.benchmark import Row, options, shown, told, write
+from tests.helpers.benchmark import Row, options, shown, write
 
 LATE_S, END_S = 15.0, 30.0
 
@@ -331,10 +331,10 @@ def main() -> None:
         for name in chosen:
             trial, jobs = TRIALS[name]
             began = time.monotonic()
-            found[name] = told(
-                pool.map(trial, jobs[: args.seeds]),
-                line=lambda row, name=name: f"{name} {shown(row)}",
-            )
+            found[name] = []
+            for row in pool.map(trial, jobs[: args.seeds]):
+                found[name].append(row)
+                print(name, shown(row), flush=True)
             spent_s = time.monotonic() - began
             print(f"{name}: {len(found[name])} trials in {spent_s:.0f} s", flush=True)
     write(args.json, json.loads(json.dumps(found, default=float)))
