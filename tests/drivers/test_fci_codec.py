@@ -46,24 +46,6 @@ def test_a_golden_state_is_read_back(protocol):
 
 
 @PROTOCOLS
-def test_a_state_lies_anywhere_in_the_buffer_and_owns_its_numbers(protocol):
-    data = bytearray(b"\xff" * 37 + frame(protocol) + b"\xff" * 11)
-    size = fci_peer.STATE_SIZE[protocol]
-    got = StateDecoder(protocol).decode(memoryview(data), 37, size)
-    data[:] = bytes(len(data))
-    assert tuple(got.q) == Q
-    assert tuple(got.tau_J) == TAU
-
-
-@PROTOCOLS
-def test_numbers_that_are_none_are_delivered(protocol):
-    got = decode(protocol, frame(protocol, q=(math.nan, math.inf, *Q[2:])))
-    assert math.isnan(got.q[0])
-    assert math.isinf(got.q[1])
-    assert tuple(got.q[2:]) == Q[2:]
-
-
-@PROTOCOLS
 def test_what_is_no_state_is_refused_with_a_sentence(protocol):
     good = frame(protocol)
     _, _, _, _, _, modes, _ = fci_peer.PLACES[protocol]
@@ -115,17 +97,6 @@ def test_golden_requests():
     rest = bytes(1 + 7 * 8)
     assert v10 == struct.pack("<IIIII6d", 1, 4, 125, 2, 4, *deviation, *deviation) + rest
     assert codec.request(12, 5) == struct.pack("<III", 12, 5, 12)
-
-
-def test_replies_are_cut_out_of_the_stream_however_it_comes():
-    first = fci_peer.reply(0, 7, struct.pack("<BH", 1, 9) + bytes(50))
-    second = fci_peer.reply(1, 8, b"\1")
-    parser = codec.ReplyParser()
-    got = [reply for k in (first + second) for reply in parser.feed(bytes([k]))]
-    assert [reply.command_id for reply in got] == [7, 8]
-    assert codec.connect_reply(got[0].payload) == (1, 9)
-    assert codec.status_reply(got[1].payload) == 1
-    assert [r.command_id for r in codec.ReplyParser().feed(first + second)] == [7, 8]
 
 
 @pytest.mark.parametrize("size", [0, 11, 1 << 30])

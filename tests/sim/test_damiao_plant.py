@@ -17,8 +17,6 @@ from tests.helpers.board_tools import (
     frame,
     mit,
     parse,
-    read_register,
-    refresh,
     rig,
 )
 
@@ -247,13 +245,3 @@ def test_lines_are_alike_bit_by_bit_when_run_twice_with_one_seed() -> None:
     assert len(first) > 500
     assert first == run(5)
     assert [x[0] for x in first] != [x[0] for x in run(6)]
-
-
-def test_a_register_read_costs_no_motion_and_the_stand_none_either() -> None:
-    with rig() as bench:
-        before = bench.boards.world.state()[1]
-        for motor in IDS:
-            bench.ask(0x7FF, read_register(motor, 21))
-            bench.ask(0x7FF, refresh(motor))
-        bench.pass_ms(500.0)
-        assert (bench.boards.world.state()[1] == before).all()

@@ -16,14 +16,11 @@ from sim.fci.codec import ERRORS, Request, RobotCommand
 from sim.fci.gripper import Fingers, GripperServer
 from sim.fci.robot import Robot
 from sim.scenarios import build
+from tests.sim.test_fci_server_faults import move
 
 ZERO = np.zeros(7)
 PREFIX = "cartesian_motion_generator_"
 TICKS = 600  # of an eased motion
-
-
-def move(controller, generator):
-    return Request("Move", 1, 5, struct.pack("<II", controller, generator) + bytes(48))
 
 
 @pytest.fixture(params=["nominal", "real_drives"])

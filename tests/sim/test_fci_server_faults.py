@@ -478,20 +478,6 @@ def test_command_serves_and_sums_up(tmp_path, capsys):
     assert json.loads(path.read_text("utf-8"))["clients"] == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        (("--fault", "dorp"), "user_stop"),
-        (("--scenario", "moon"), "wall_mounted"),
-        (("--set", "noise"), "KEY=VALUE"),
-        (("--set", "noise=loud"), "real, none"),
-    ],
-)
-def test_command_says_what_is_wrong(words, part):
-    with pytest.raises(ValueError, match=part):
-        shell(*words)
-
-
 def test_bad_options_name_the_choices():
     for options in ({"protocol": 7}, {"faults": ["x"]}):
         with pytest.raises(ValueError, match="have:"):
