@@ -13,8 +13,6 @@ from enum import IntEnum, StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.fci import tables
-from drivers.fci.tables import ERROR_NAMES as ERRORS
 from sim.effects import Array
 
 VERSIONS = (5, 10)
@@ -38,6 +36,37 @@ FIELDS = (
 )  # fmt: skip
 ACCELEROMETERS = (("accelerometer_top", 18), ("accelerometer_bottom", 18))  # version 10 only
 
+ERRORS = (
+    "joint_position_limits_violation", "cartesian_position_limits_violation",
+    "self_collision_avoidance_violation", "joint_velocity_violation",
+    "cartesian_velocity_violation", "force_control_safety_violation", "joint_reflex",
+    "cartesian_reflex", "max_goal_pose_deviation_violation", "max_path_pose_deviation_violation",
+    "cartesian_velocity_profile_safety_violation",
+    "joint_position_motion_generator_start_pose_invalid",
+    "joint_motion_generator_position_limits_violation",
+    "joint_motion_generator_velocity_limits_violation",
+    "joint_motion_generator_velocity_discontinuity",
+    "joint_motion_generator_acceleration_discontinuity",
+    "cartesian_position_motion_generator_start_pose_invalid",
+    "cartesian_motion_generator_elbow_limit_violation",
+    "cartesian_motion_generator_velocity_limits_violation",
+    "cartesian_motion_generator_velocity_discontinuity",
+    "cartesian_motion_generator_acceleration_discontinuity",
+    "cartesian_motion_generator_elbow_sign_inconsistent",
+    "cartesian_motion_generator_start_elbow_invalid",
+    "force_controller_desired_force_tolerance_violation", "start_elbow_sign_inconsistent",
+    "communication_constraints_violation", "power_limit_violation",
+    "cartesian_motion_generator_joint_position_limits_violation",
+    "cartesian_motion_generator_joint_velocity_limits_violation",
+    "cartesian_motion_generator_joint_velocity_discontinuity",
+    "cartesian_motion_generator_joint_acceleration_discontinuity",
+    "cartesian_position_motion_generator_invalid_frame_flag",
+    "controller_torque_discontinuity", "joint_p2p_insufficient_torque_for_planning",
+    "tau_J_range_violation", "instability_detected", "joint_move_in_wrong_direction",
+    "cartesian_spline_motion_generator_violation",
+    "joint_via_motion_generator_planning_joint_limit_violation",
+    "base_acceleration_initialization_timeout", "base_acceleration_invalid_reading",
+)  # fmt: skip
 COMMAND_BYTES = {5: 370, 10: 371}
 _Q_AT, _DQ_AT, _POSE_AT, _TWIST_AT, _ELBOW_AT, _ELBOW_VALID = 8, 64, 120, 248, 296, 312
 _GENERATOR_END, _TAU_AT, _TORQUE_END = 313, 314, 370
@@ -187,26 +216,61 @@ def read_command(data: bytes | bytearray | memoryview, version: int) -> RobotCom
 class Status(StrEnum):
     """What a reply says; each has another number in each version and for each request."""
 
-    OK = "success"
-    NOT_POSSIBLE = "not_possible"
-    INVALID = "invalid_argument"
-    STARTED = "motion_started"
+    OK = "ok"
+    NOT_POSSIBLE = "not possible"
+    INVALID = "invalid argument"
+    STARTED = "motion started"
     PREEMPTED = "preempted"
     REFLEX = "reflex"
-    EMERGENCY = "user_stop"
-    INPUT_ERROR = "input_error"
+    EMERGENCY = "emergency"
+    INPUT_ERROR = "input error"
     ABORTED = "aborted"
-    MANUAL = "manual_recovery"
+    MANUAL = "manual recovery required"
     INCOMPATIBLE = "incompatible"
     ERROR = "error"
 
 
-_CODES = {
-    "Move": tables.MOVE_STATUS,
-    "StopMove": tables.STOP_STATUS,
-    "AutomaticErrorRecovery": tables.RECOVER_STATUS,
+# Request -> status -> number in version 5 and in version 10.
+_CODES: dict[str, dict[Status, tuple[int, int]]] = {
+    "Move": {
+        Status.OK: (0, 0),
+        Status.STARTED: (1, 1),
+        Status.PREEMPTED: (2, 2),
+        Status.NOT_POSSIBLE: (3, 5),
+        Status.INVALID: (5, 7),
+        Status.REFLEX: (6, 8),
+        Status.EMERGENCY: (7, 9),
+        Status.INPUT_ERROR: (8, 10),
+        Status.ABORTED: (9, 11),
+    },
+    "StopMove": {
+        Status.OK: (0, 0),
+        Status.NOT_POSSIBLE: (1, 1),
+        Status.EMERGENCY: (2, 3),
+        Status.REFLEX: (3, 4),
+        Status.ABORTED: (4, 5),
+    },
+    "AutomaticErrorRecovery": {
+        Status.OK: (0, 0),
+        Status.NOT_POSSIBLE: (1, 1),
+        Status.MANUAL: (2, 3),
+        Status.REFLEX: (3, 4),
+        Status.EMERGENCY: (4, 5),
+        Status.ABORTED: (5, 6),
+    },
 }
-_OTHERS = {Status.OK: 0, Status.INVALID: 2}  # all else: not possible, an error
+_OTHERS = {
+    Status.OK: (0, 0),
+    Status.NOT_POSSIBLE: (1, 1),
+    Status.INCOMPATIBLE: (1, 1),
+    Status.ERROR: (1, 1),
+    Status.INVALID: (2, 2),
+}
+
+
+def code_of(request: str, status: Status, version: int) -> int:
+    """Number of a status in the reply to a request, one of `NAMES`."""
+    return _CODES.get(request, _OTHERS)[status][version == 10]
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +341,6 @@ class RequestReader:
 
 def reply(request: Request, status: Status, version: int, rest: bytes = b"") -> bytes:
     """A reply: header, status byte, and whatever this request's reply has besides."""
-    codes = _CODES.get(request.name)
-    code = _OTHERS.get(status, 1) if codes is None else codes[version].index(status)
+    code = code_of(request.name, status, version)
     size = HEADER.size + 1 + len(rest)
     return HEADER.pack(request.number, request.ident, size) + bytes((code,)) + rest

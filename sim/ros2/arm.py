@@ -19,21 +19,28 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from cyclonedds.util import duration
 
 from drivers.interface import DriverError
-from drivers.ros2.wire import LOCAL, quality
 from sim.faults import Faults
 from sim.fci.clock import PRIORITY, Ticks, undisturbed
 from sim.options import Ending, options_of, sum_up
 from sim.ros2.options import KINDS
 from sim.scenarios import Scenario, build
-from sim.urdf_writer import urdf
+from sim.truth import Truth
+from sim.urdf_writer import joint_text, limit_text
 
+LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces>
+<NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
+</General><Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>64</MaxAutoParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers>
+</Discovery></Domain></CycloneDDS>"""
 FINGERS = {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02}
 SUBSTEPS = 2
 OFF_RAD = 0.5  # by which a joint is wrong where faults say so
@@ -100,14 +107,14 @@ class ServedArm:
         self._plant = scenario.plant(substeps=SUBSTEPS)
         with suppress(OSError):  # the threads of DDS inherit it: a machine that is busy delays them
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        self._domain = Domain(place.domain, LOCAL)
+        self._domain = Domain(place.domain, LOOPBACK)
         self._participant = DomainParticipant(place.domain)
         self._states = self._writer(place.states, JointState, latched=False)
         topic = Topic(self._participant, "rt" + place.commands, Float64MultiArray)
         self._commands = DataReader(self._participant, topic, qos=quality(False, 1))
         if place.described:
             self._description = self._writer("/robot_description", String, latched=True)
-            self._description.write(String(urdf(scenario.truth, limited=True)))
+            self._description.write(String(description(scenario.truth)))
         names = (*self._plant.joint_names, *FINGERS)
         self._order = np.argsort(names)
         self._names = [names[k] for k in self._order]
@@ -194,6 +201,28 @@ class ServedArm:
     def close(self) -> None:
         """Free the simulator."""
         self._plant.close()
+
+
+def quality(latched: bool, depth: int) -> Qos:
+    """As joint_state_broadcaster and the controllers have it: reliable and volatile."""
+    durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
+    return Qos(
+        Policy.Reliability.Reliable(duration(milliseconds=100)),
+        durability,
+        Policy.History.KeepLast(depth),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )
+
+
+def description(truth: Truth) -> str:
+    """URDF of the joints with their limits; of the links their names."""
+    parts, parent = ['<robot name="arm"><link name="base"/>'], "base"
+    for j, (name, link) in enumerate(zip(truth.joint_names, truth.link_names, strict=True)):
+        place = truth.p[j], truth.R[j]
+        parts.append(f'<link name="{link}"/>')
+        parts.append(joint_text(name, (parent, link), place, limit_text(truth.limits, j)))
+        parent = link
+    return "\n".join([*parts, "</robot>"])
 
 
 def run(args: argparse.Namespace) -> int:

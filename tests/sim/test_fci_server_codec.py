@@ -152,28 +152,28 @@ def test_random_bytes_are_refused_or_read(data, version):
 def test_replies_have_their_published_bytes():
     connect = Request("Connect", 0, 9, struct.pack("<HH", 5, 4000))
     assert connect.connect_terms() == (5, 4000)
-    said = reply(connect, "success", 5, struct.pack("<H", 5))
+    said = reply(connect, "ok", 5, struct.pack("<H", 5))
     assert said == bytes.fromhex("00000000 09000000 0f000000 00 0500")
     assert reply(connect, "incompatible", 5)[12:] == bytes((1,))
     move = Request("Move", 1, 2, struct.pack("<II", 2, 1) + bytes(48))
     assert move.move_modes() == (2, 1)
-    assert reply(move, "motion_started", 5) == bytes.fromhex("01000000 02000000 0d000000 01")
+    assert reply(move, "motion started", 5) == bytes.fromhex("01000000 02000000 0d000000 01")
     limit = Request("GetCartesianLimit", 3, 0, bytes(4))
-    assert len(reply(limit, "success", 5, bytes(LIMIT_REPLY))) == 166
+    assert len(reply(limit, "ok", 5, bytes(LIMIT_REPLY))) == 166
 
 
 @pytest.mark.parametrize(
     ("name", "status", "codes"),
     [
-        ("Move", "preempted", (2, 2)), ("Move", "not_possible", (3, 5)),
-        ("Move", "invalid_argument", (5, 7)), ("Move", "reflex", (6, 8)),
-        ("Move", "user_stop", (7, 9)), ("Move", "aborted", (9, 11)),
-        ("StopMove", "success", (0, 0)), ("StopMove", "reflex", (3, 4)),
-        ("StopMove", "user_stop", (2, 3)),
-        ("AutomaticErrorRecovery", "manual_recovery", (2, 3)),
+        ("Move", "preempted", (2, 2)), ("Move", "not possible", (3, 5)),
+        ("Move", "invalid argument", (5, 7)), ("Move", "reflex", (6, 8)),
+        ("Move", "emergency", (7, 9)), ("Move", "aborted", (9, 11)),
+        ("StopMove", "ok", (0, 0)), ("StopMove", "reflex", (3, 4)),
+        ("StopMove", "emergency", (2, 3)),
+        ("AutomaticErrorRecovery", "manual recovery required", (2, 3)),
         ("AutomaticErrorRecovery", "reflex", (3, 4)),
-        ("AutomaticErrorRecovery", "user_stop", (4, 5)),
-        ("SetLoad", "invalid_argument", (2, 2)), ("SetLoad", "not_possible", (1, 1)),
+        ("AutomaticErrorRecovery", "emergency", (4, 5)),
+        ("SetLoad", "invalid argument", (2, 2)), ("SetLoad", "not possible", (1, 1)),
     ],
 )  # fmt: skip
 def test_codes_shift_between_the_versions(name, status, codes):
