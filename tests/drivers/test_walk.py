@@ -1,4 +1,4 @@
-"""All messages of a stretch of records are found, up to a cut, an end or so many."""
+"""Messages whose sizes come again in turn are found at once, and none else than one by one."""
 
 import struct
 
@@ -37,7 +37,7 @@ def test_a_walk_finds_what_is_there(seed, most):
     rng = np.random.default_rng(seed)
     parts: list[bytes] = []
     for _ in range(rng.integers(1, 6)):
-        sizes = rng.integers(22, 90, rng.integers(1, 13))
+        sizes = rng.integers(22, 90, rng.integers(1, 13))  # some turns are longer than looked for
         for _ in range(rng.integers(1, 60)):
             parts += [one(MESSAGE, int(x), rng) for x in sizes]
         if rng.random() < 0.7:
