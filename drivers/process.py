@@ -1,14 +1,18 @@
-"""A process of a driver's own, and the memory that the two share."""
+"""A process of a driver's own, memory to share with it, signals that end one, waking in time."""
 
 from __future__ import annotations
 
 import ctypes
 import mmap
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any, Self
 
 
@@ -54,3 +58,34 @@ def start_module(
         env={**os.environ, "PYTHONPATH": path},
         **how,
     )
+
+
+class StopSignals:
+    """Counts SIGINT, SIGTERM and SIGHUP in place of their usual effect (main thread only).
+
+    A SIGHUP that is ignored (`nohup`) stays so.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
+                    continue
+                self._before[number] = signal.signal(number, self._hear)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _hear(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+
+
+def sleep_until(deadline_ns: int) -> None:
+    """Sleep until CLOCK_MONOTONIC shows `deadline_ns`."""
+    time.sleep(max(1e-9 * (deadline_ns - time.monotonic_ns()), 0.0))

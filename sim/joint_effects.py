@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -28,30 +29,10 @@ COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_
 NEWTON_ROUNDS = 8
 NEWTON_DONE = 1e-12  # rad/s
 
-
-class Row(IntEnum):
-    """Kinds of rows, one for each effect on a motion: kind, joint, other joint, three parameters
-    in the order of `SPECS`, start and end.
-    """
-
-    VISCOUS_FRICTION = 0
-    COULOMB_FRICTION = 1
-    ASYMMETRIC_FRICTION = 2
-    STRIBECK_FRICTION = 3
-    BRISTLE_FRICTION = 4
-    LOAD_DEPENDENT_FRICTION = 5
-    FRICTION_DRIFT = 6
-    MOTOR_INERTIA = 7
-    TORQUE_RIPPLE = 8
-    JOINT_SPRING = 9
-    X_QUADRATIC_DRAG = 10
-    X_CUBIC_SPRING = 11
-    X_POSITION_FRICTION = 12
-    X_SINE_DISTURBANCE = 13
-    X_VELOCITY_RIPPLE = 14
-    X_CROSS_VISCOUS = 15
-
-
+# Kinds of rows, one for each effect on a motion: kind, joint, other joint, three parameters in the
+# order of `SPECS`, start and end.
+_enumerated: Any = IntEnum  # its members' names come from the table
+Row = _enumerated("Row", [k.upper() for k, (place, *_) in SPECS.items() if place == MOTION])
 ROW = 8  # numbers
 
 

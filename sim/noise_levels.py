@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -50,10 +50,6 @@ class NoiseLevels:
                 raise ValueError(f"noise {item.name!r} is negative or not a number")
         if self.dropouts >= 1.0:
             raise ValueError(f"noise 'dropouts' is {self.dropouts}; have: below 1")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for a truth file."""
-        return asdict(self)
 
 
 def check_levels(levels: Any) -> None:

@@ -8,8 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import signal
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any, NamedTuple
 
 from drivers.errors import choices
 from drivers.files.bounded import parse_json
+from drivers.process import StopSignals
 from sim.noise_levels import NOISES, check_levels
 
 DEFAULT_SCENARIO = "nominal"
@@ -138,8 +137,8 @@ def _size(name: str, key: str, value: Any) -> float:
     return number
 
 
-class Ending:
-    """How a served arm ends: at SIGTERM or SIGINT, or when its time is over.
+class Ending(StopSignals):
+    """How a served arm ends: at SIGTERM, SIGINT or SIGHUP, or when its time is over.
 
     To be entered in the main thread; the signals have their usual effect again behind it.
 
@@ -148,24 +147,12 @@ class Ending:
     """
 
     def __init__(self, duration_s: float | None) -> None:
-        self._event = threading.Event()
-        self._end = None if duration_s is None else time.monotonic() + duration_s
-
-    def __enter__(self) -> Ending:
-        numbers = (signal.SIGTERM, signal.SIGINT)
-        self._before = {number: signal.signal(number, self._hear) for number in numbers}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _hear(self, number: int, frame: object) -> None:
-        self._event.set()
+        super().__init__()
+        self._end_s = math.inf if duration_s is None else time.monotonic() + duration_s
 
     def is_set(self) -> bool:
         """Whether to end."""
-        return self._event.is_set() or (self._end is not None and time.monotonic() >= self._end)
+        return self.count > 0 or time.monotonic() >= self._end_s
 
 
 def sum_up(summary: Mapping[str, Any], lines: str | None, path: Path | None) -> None:

@@ -19,7 +19,6 @@ from sim.truth import Array, Truth
 PERIOD_NS = round(PERIOD_S * 1e9)
 REFRESH_TICKS = 20  # a command counts for 20 ms of plant time, then the brakes close
 BRAKE_TIME_S = 0.02  # below the full deceleration, speed dies away with this time constant
-LOCK_BELOW = 0.01  # rad/s, a slower joint is held where it is
 LOCK_RATE = 60.0  # 1/s, the critically damped hold
 RELEASE_TICKS = 100  # for which the arm only damps: what it leans on pushes it back meanwhile
 
@@ -87,9 +86,8 @@ class Plant:
         self._age = self._braked_ticks = 0
         self._lock, self._moving = self._q.copy(), np.zeros(truth.n, dtype=bool)
         self._k = -1
-        self._clean: JointSample | None = None
         self._seen = self._q, self._dq, self._drive
-        self._observe()  # what is compiled on first use is compiled before the clock runs
+        self.clean()  # what is compiled on first use is compiled before the clock runs
 
     def read(self) -> JointSample:
         """Move on by one period and say what arrives; the first call is t = 0, before any motion.
@@ -100,25 +98,16 @@ class Plant:
         sample = None
         while sample is None:
             self._advance()
-            self._clean = self._observe()
-            sample = self._noise.measure(self._k, self._clean)
+            sample = self._noise.measure(self._k, self.clean())
             if self._imus is not None:
                 heard = self._imus.read(self._link_motion())
                 sample = None if sample is None else replace(sample, links=heard)
         self.compute_ns = time.perf_counter_ns() - begun
         return sample
 
-    def clean(self) -> JointSample:
-        """What the last `read` would have said without noise and with a perfect clock."""
-        return self._observe() if self._clean is None else self._clean
-
     def link_state(self) -> tuple[Array, Array, Array]:
         """True q, dq of the links and true driving torque at the last sample, (n,) each."""
         return self._q, self._dq, self._drive
-
-    def pushed(self) -> Array:
-        """Torque (n,) N m that what is in the way puts on the joints."""
-        return self._engine.obstacles.torque
 
     def ddq(self) -> Array:
         """True joint acceleration (n,) at the last sample, rad/s²."""
@@ -167,7 +156,7 @@ class Plant:
     def _brake(self) -> Array:
         """Driving torque (n,) at the end of the next tick that slows down and then holds."""
         self._braked_ticks += 1
-        still = np.abs(self._dq) < LOCK_BELOW
+        still = np.abs(self._dq) < 0.01  # rad/s, a slower joint is held where it is
         stopped = self._moving & still & (self._braked_ticks > RELEASE_TICKS)
         self._lock[stopped] = self._q[stopped]
         self._moving &= ~stopped
@@ -188,8 +177,8 @@ class Plant:
             self.fault = f"{self.joint_names[j]} {what} ({at})"
             self.stop()
 
-    def _observe(self) -> JointSample:
-        """The present instant, without noise."""
+    def clean(self) -> JointSample:
+        """What the last `read` would have said without noise and with a perfect clock."""
         if self._sensors is None:
             self._seen = self._q, self._dq, self._drive
         q, dq, tau = self._seen

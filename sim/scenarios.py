@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ class Scenario:
             **self.truth.as_dict(),
             "links_measured": self.links,
             "imus": list(self.imus),
-            "noise": self.noise.as_dict(),
+            "noise": asdict(self.noise),
         }
 
     def write_truth(self, path: Path | str) -> None:

@@ -93,10 +93,5 @@ def recording_metadata(
     config: Config, robot: SelfModel, command: str, **more: Any
 ) -> dict[str, Any]:
     """What a recording carries so that a replay repeats the run."""
-    return {
-        "config": config_table(config),
-        "version": program_version(),
-        "robot": robot.name,
-        "command": command,
-        **more,
-    }
+    told = {"config": config_table(config), "version": program_version()}
+    return {**told, "robot": robot.name, "command": command, **more}

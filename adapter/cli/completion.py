@@ -13,10 +13,8 @@ from adapter.shadowed import own_name
 
 SHELLS = ("bash", "zsh", "fish")
 # Options whose names another room knows: where they are, loaded when one is asked for.
-NAMES_OF = {
-    "effects": ("adapter.effects.catalogue", "LEARNED"),
-    "scenario": ("sim.options", "SCENARIOS"),
-}
+LEARNED, SCENARIOS = ("adapter.effects.catalogue", "LEARNED"), ("sim.options", "SCENARIOS")
+NAMES_OF = {"effects": LEARNED, "scenario": SCENARIOS}
 
 
 def declare(parser: argparse.ArgumentParser) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column
 from rich.text import Text
 from rich.tree import Tree as Shown
 
@@ -15,7 +14,7 @@ from adapter import discovery
 from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.runs.compiling import announce_compiling
-from adapter.runs.terminal import labelled, output, say, show, warn, write_json
+from adapter.runs.terminal import labelled, output, print_table, say, show, warn, write_json
 from drivers.files.mcap import read_log
 
 
@@ -55,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             rows.append((name, *(" ".join(f"{x:6.3f}" for x in row) for row in numbers)))
         if rows:
             heads = "sensor of", "axis in its frame", "x y z in the joint's frame, m"
-            _print_table(heads, rows)
+            print_table([Column(x, no_wrap=True) for x in heads], rows)
         if args.model is not None:
             figures.update(_write_model(args, found, learned))
     write_json(args.json, figures)
@@ -70,11 +69,9 @@ def _print_tree(found: discovery.Discovery) -> None:
     )
     carried = {edge.link for edge in found.edges}
     parents = [edge.parent for edge in found.edges if edge.parent is not None]
-    roots = dict.fromkeys(
-        [name for name in log.link_names if name not in carried]
-        + [name for name in parents if name not in log.link_names]
-    )
-    for root in roots:
+    roots = [name for name in log.link_names if name not in carried]
+    roots += [name for name in parents if name not in log.link_names]
+    for root in dict.fromkeys(roots):
         top = Shown(Text(root, "bold"))
         _hang(top, root, found.edges)
         output.print(top)
@@ -100,23 +97,13 @@ def _print_lambda(learned: discovery.LearnedTree, known: np.ndarray) -> None:
     rows = []
     for j, name in enumerate(tree.joint_names):
         turn, place = (" ".join(f"{x:6.3f}" for x in part) for part in np.split(schema.lam[j], 2))
-        spread = " ".join(
-            f"{np.nanmax(part):.1g}" if np.isfinite(part).any() else "-"
-            for part in np.split(known[j], 2)
-        )
+        most = (np.fmax.reduce(part) for part in np.split(known[j], 2))
+        spread = " ".join(f"{x:.1g}" if np.isfinite(x) else "-" for x in most)
         rows.append((name, turn, place, f"{schema.ranks[j]}/6", spread))
-    _print_table(("joint", "α β γ rad", "p m", "shown", "± rad, m"), rows)
+    heads = ("joint", "α β γ rad", "p m", "shown", "± rad, m")
+    print_table([Column(x, no_wrap=True) for x in heads], rows)
     for sentence in schema.freedom.words(tree):
         show(f"arbitrary, as no motion shows it: {sentence}")
-
-
-def _print_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    table = Table(box=None, pad_edge=False)
-    for heading in heads:
-        table.add_column(heading, no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
-    output.print(table)
 
 
 def _write_model(
@@ -131,8 +118,6 @@ def _write_model(
     show(f"{args.model}: {what}")
     arbitrary = model.provenance["discovered"]["theta_arbitrary"]
     if left is not None and arbitrary:
-        show(
-            f"θ of {len(arbitrary)} links is arbitrary where no torque shows it; the model file "
-            "lists what"
-        )
+        said = "is arbitrary where no torque shows it; the model file lists what"
+        show(f"θ of {len(arbitrary)} links {said}")
     return {"model": str(args.model), "torque_rmse_nm": left, "theta_arbitrary": arbitrary}

@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.table import Table
-
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.kept import keep, with_kept
 from adapter.effects.law import EXPRESSIONS, LAW
 from adapter.errors import UsageError
-from adapter.runs.terminal import output, show
+from adapter.runs.terminal import print_table, show
 
 
 def run(args: argparse.Namespace) -> int:
@@ -22,13 +20,13 @@ def run(args: argparse.Namespace) -> int:
         show(keep(Path(args.keep[1]), args.name, args.joint, args.kept))
         show(f"kept in {args.kept}; looked for by adapter gap ... --effects {args.kept}")
         return 0
-    table = Table("name", "what", "of", "numbers", box=None, pad_edge=False)
+    rows = []
     with with_kept(args.kept if args.kept.exists() else None):
         for effect in CATALOGUE.values():
             numbers = ", ".join(f"{p.key} {p.written}".rstrip() for p in effect.parameters)
             own = f" ({effect.in_files.removeprefix(LAW)})" if effect.in_files else ""
-            table.add_row(effect.name, f"{effect.title}{own}", effect.scope, numbers)
-    output.print(table)
+            rows.append((effect.name, f"{effect.title}{own}", effect.scope, numbers))
+    print_table(("name", "what", "of", "numbers"), rows)
     said = ", ".join(EXPRESSIONS)
     show(f"laws of what none of these is: c times {said} (ⱼ: another joint's)")
     return 0

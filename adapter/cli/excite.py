@@ -7,6 +7,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -139,20 +140,17 @@ def _until(
     told: Information, known: Known, motion: DesignedMotion, args: argparse.Namespace
 ) -> tuple[float, Expected]:
     """How long it takes, s of path, and what is known then; `--longest` where it is not enough."""
-    tenth = TENTH * motion.period_s
-    instants = motion.table(TABLE)
-    size = round(TABLE * TENTH)
+    tenth, instants, size = TENTH * motion.period_s, motion.table(TABLE), round(TABLE * TENTH)
     brought = known.information if known.information is not None else np.zeros_like(told.prior)
-    k = 0
-    while True:
-        part = np.arange(k * size, (k + 1) * size) % TABLE
+    for k in count(1):
+        part = np.arange((k - 1) * size, k * size) % TABLE
         H = told.mean(*(signal[part] for signal in instants))
         brought = brought + tenth * told.samples_per_s * H
-        k += 1
         expected = told.expected(brought, args.std)
         enough = expected.worst <= 1.0 and k * TENTH >= 1.0
         if enough or (k + 1) * tenth > args.longest:
-            return k * tenth, expected
+            break
+    return k * tenth, expected
 
 
 def _told(
@@ -194,14 +192,13 @@ def _figures(
     told: Information, motion: DesignedMotion, seconds: float, expected: Expected
 ) -> dict[str, Any]:
     numbers = (expected.std.tolist(), expected.wanted.tolist(), expected.shown.tolist())
+    rows = zip(expected.names, expected.units, *numbers, strict=True)
+    keys = ("name", "unit", "std", "wanted", "shown")
     return {
         "seconds": seconds,
         "period_s": motion.period_s,
         "condition": told.condition(*motion.table(TABLE)),
-        "parameters": [
-            dict(zip(("name", "unit", "std", "wanted", "shown"), row, strict=True))
-            for row in zip(expected.names, expected.units, *numbers, strict=True)
-        ],
+        "parameters": [dict(zip(keys, row, strict=True)) for row in rows],
     }
 
 
@@ -223,10 +220,8 @@ def _measured_next(path: Path, robot: SelfModel) -> list[tuple[int, DecidingExpe
     for text in sorted(others):
         say(f"No motion alone does this: {text}.")
     if not wanted:
-        raise SettingsError(
-            f"{path}: no experiment that a motion can make is asked for; design one that teaches "
-            "all (without --gap)"
-        )
+        said = "no experiment that a motion can make is asked for; design one that teaches all"
+        raise SettingsError(f"{path}: {said} (without --gap)")
     for j, experiment in wanted:
         show(f"{robot.tree.joint_names[j]}: {experiment.do}")
     return wanted

@@ -130,11 +130,8 @@ def _model_lines(model: SelfModel) -> list[str]:
         hint = "" if shown.all() else "; without ±: no motion shows this one alone"
     lines.append(f"mass       {', '.join(masses)} kg, link by link{hint}")
     lines += [f"effect     {text}" for text in _effect_lines(model)]
-    lines += [
-        f"{label:10s} {told[key]}"
-        for key, label in (("command", "made by"), ("source", "from"), ("program", "with"))
-        if told.get(key)
-    ]
+    labels = ("command", "made by"), ("source", "from"), ("program", "with")
+    lines += [f"{label:10s} {told[key]}" for key, label in labels if told.get(key)]
     return lines
 
 

@@ -25,13 +25,8 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     options.add_topic(parser)
     said = "the arm as documented, whose joints' names are taken, in its order"
     add("--robot", metavar="NAME|FILE", help=said)
-    add(
-        "--joints",
-        type=options.names_in,
-        default=(),
-        metavar="A,B,C",
-        help="joint names, commas between",
-    )
+    said = "joint names, commas between"
+    add("--joints", type=options.names_in, default=(), metavar="A,B,C", help=said)
     said = "joints that are called otherwise: A in the source, B here; LEFT_*=* takes off a prefix"
     add("--names", type=options.names_in, default=(), metavar="A=B,...", help=said)
     add("--flat", action="store_true", help="one value per line")

@@ -10,24 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from rich.progress import Progress
-from rich.table import Table
+from rich.table import Column
 
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_urdf
 from adapter.model.model_file import save_model, whole_file
-from adapter.report.fleet_page import (
-    HEADS,
-    as_json,
-    log_rows,
-    sentences,
-    summary,
-    to_be_shown,
-    write_fleet_page,
-)
+from adapter.report import fleet_page
 from adapter.runs.fleet import fleet
 from adapter.runs.fleet.arm import FleetArm
-from adapter.runs.terminal import console, output, results_folder, say, show, warn, write_json
+from adapter.runs.terminal import console, print_table, results_folder, say, show, warn, write_json
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,12 +27,11 @@ def run(args: argparse.Namespace) -> int:
     robot = robot_of(args, args.model)
     given = fleet.found_logs(args.logs)
     folder = results_folder(args.out, "fleet")
-    manifest = (
-        fleet.Manifest({}, {}) if args.manifest is None else fleet.read_manifest(args.manifest)
-    )
-    settings = fleet.Settings(
-        folder, args.workers, args.cluster, args.by, manifest, args.topic, told_of(args)
-    )
+    manifest = fleet.Manifest({}, {})
+    if args.manifest is not None:
+        manifest = fleet.read_manifest(args.manifest)
+    how = args.workers, args.cluster, args.by, manifest, args.topic
+    settings = fleet.Settings(folder, *how, told_of(args))
     fleet.forget(args.forget, robot, settings)
     fleet.recall(args.remember, robot, settings)
     say(f"{len(given)} recordings; moments are kept in {folder}")
@@ -53,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     if told and not told & {*given, *(x.moments.path for a in found.arms for x in a.logs)}:
         warn([f"{args.manifest}: tells of none of these recordings (paths are as in its folder)"])
     warn([f"{path}: the same recording as {other}; it counts once" for path, other in found.alike])
-    figures = as_json(found)
+    figures = fleet_page.as_json(found)
     for arm, names in zip(found.arms, figures["arms"], strict=True):
         name = re.sub(r"[^\w.-]+", "_", arm.name).strip("._") or "arm"
         path = save_model(arm.model, folder / f"{name}.json")
@@ -61,13 +52,13 @@ def run(args: argparse.Namespace) -> int:
         names["model"] = str(path)
         if not args.quiet:
             _print(arm)
-    for line in summary(found):
+    for line in fleet_page.summary(found):
         show(line)
     figures["table"] = str(_write_table(found, folder))
     page = folder / "fleet.html"
     page.unlink(missing_ok=True)  # of earlier models
     if not args.no_report:
-        figures["report"] = str(write_fleet_page(found, page))
+        figures["report"] = str(fleet_page.write_fleet_page(found, page))
         show(figures["report"])
     write_json(args.json, figures)
     return ExitCode.DONE if found.arms else ExitCode.NOTHING_LEARNED
@@ -129,14 +120,10 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
 
 
 def _print(arm: FleetArm) -> None:
-    shown = to_be_shown(arm, 40)  # of more, those that there is something to say of
-    table = Table(box=None, pad_edge=False, title=arm.name, title_justify="left")
-    for number, head in enumerate(HEADS):
-        table.add_column(head, no_wrap=number > 0, overflow="fold")
-    for row in log_rows(arm, shown):
-        table.add_row(*row)
-    output.print(table)
+    shown = fleet_page.to_be_shown(arm, 40)  # of more, those that there is something to say of
+    heads = [Column(x, no_wrap=k > 0, overflow="fold") for k, x in enumerate(fleet_page.HEADS)]
+    print_table(heads, fleet_page.log_rows(arm, shown), title=arm.name, title_justify="left")
     if len(shown) < len(arm.logs):
         show(f"{len(arm.logs) - len(shown)} recordings of which nothing is to be said")
-    for line in sentences(arm):
+    for line in fleet_page.sentences(arm):
         show(line)

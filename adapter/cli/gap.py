@@ -31,25 +31,14 @@ from adapter.model.model_file import load_model
 from adapter.report.gap_page import render_gap_page
 from adapter.report.html import write_whole
 from adapter.report.servo_page import render_servo_page
+from adapter.runs import terminal
 from adapter.runs.compiling import announce_compiling
-from adapter.runs.terminal import (
-    complain,
-    console,
-    output,
-    results_folder,
-    say,
-    show,
-    warn,
-    write_json,
-)
 from adapter.screening.screen import RecordingRefused
 from adapter.simulate import Rollouts
 from drivers.files.mcap import Log, read_log, read_position_log
 
-WITH_TORQUE = (  # options
-    *("validate_from", "rounds", "turn_or_zero", "tau", "trust_log"),
-    *("tau_gain", "gear", "known_load"),
-)
+WITH_TORQUE = ["validate_from", "rounds", "turn_or_zero", "tau", "trust_log"]
+WITH_TORQUE += ["tau_gain", "gear", "known_load"]  # options
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,9 +61,9 @@ def _run(args: argparse.Namespace) -> int:
         settings = replace(settings, inertia_prior=args.inertia_prior)
     if args.rounds is not None:
         settings = replace(settings, rounds=args.rounds)
-    announce_compiling(say)
+    announce_compiling(terminal.say)
     nominal = robot_of(args, args.model)
-    folder = results_folder(args.out, "gap")
+    folder = terminal.results_folder(args.out, "gap")
     model_out = folder / "model.json"
     for new in (model_out, model_out.with_suffix(".urdf")):  # never over the one it comes from
         if new.exists() and Path(args.model).exists() and new.samefile(args.model):
@@ -87,7 +76,7 @@ def _run(args: argparse.Namespace) -> int:
         names, called = nominal.tree.joint_names, names_of([*args.logs, *args.hold_out])
         nothing = GapResult.untold(names, nominal.name, called, args.model, str(refusal))
         _write(args, folder, {**as_json(nothing), "refused": refusal.kind})
-        complain(refusal)
+        terminal.complain(refusal)
         return ExitCode.WRONG_USE
     result = replace(result, model_in=args.model)
     if rollouts is not None:
@@ -106,7 +95,7 @@ def _rollouts(args: argparse.Namespace) -> Rollouts | None:
     except MeansError as error:
         if args.simulator is not None:
             raise
-        warn([f"torques are compared, and nothing is simulated: {error}"])
+        terminal.warn([f"torques are compared, and nothing is simulated: {error}"])
         return None
 
 
@@ -115,7 +104,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[str], None]]:
     if quiet:
         yield lambda text: None
         return
-    with console.status("starting") as status:
+    with terminal.console.status("starting") as status:
         yield lambda text: status.update(Text(text))
 
 
@@ -147,14 +136,14 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
         more["report"] = str(page)
     _write(args, folder, {**as_json(result), **more})
     for line in console_summary(result):
-        output.print(Text.from_markup(line), soft_wrap=True)
+        terminal.output.print(Text.from_markup(line), soft_wrap=True)
     if "report" in more:
-        show(f"report {more['report']}")
+        terminal.show(f"report {more['report']}")
 
 
 def _write(args: argparse.Namespace, folder: Path, figures: Mapping[str, object]) -> None:
-    write_json(folder / "gap.json", figures)
-    write_json(args.json, figures)
+    terminal.write_json(folder / "gap.json", figures)
+    terminal.write_json(args.json, figures)
 
 
 def _position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | None:
@@ -175,10 +164,8 @@ def _position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | No
             )
         return None
     if without:
-        raise UsageError(
-            f"{', '.join(map(str, without))}: not commands and positions alone, as the others are; "
-            "give recordings of one kind"
-        )
+        said = "not commands and positions alone, as the others are; give recordings of one kind"
+        raise UsageError(f"{', '.join(map(str, without))}: {said}")
     found = {path: log for path, log in read.items() if log is not None}
     return [found[path] for path in args.logs], [found[path] for path in args.hold_out]
 
@@ -192,8 +179,8 @@ def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list
     model = robot_of(args, args.model)
     names = model.tree.joint_names
     documented = None if args.servo is None else read_servos(args.servo, names)
-    announce_compiling(say)
-    folder = results_folder(args.out, "gap")
+    announce_compiling(terminal.say)
+    folder = terminal.results_folder(args.out, "gap")
     target = folder / "servo.toml"
     if args.servo is not None and target.exists() and target.samefile(args.servo):
         raise UsageError(f"--out {folder} would overwrite {args.servo}; give another folder")
@@ -203,7 +190,7 @@ def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list
             gap = explain(logs, model, documented, hold_out, progress=tell, **more)
     except RecordingRefused as refusal:
         _write(args, folder, {"headline": str(refusal), "problem": str(refusal), "findings": []})
-        complain(refusal)
+        terminal.complain(refusal)
         return ExitCode.DONE if refusal.kind.is_an_answer else ExitCode.WRONG_USE
     gap.servos.save(target)
     facts = {**servo_words.as_json(gap), "servos_out": str(target)}
@@ -213,17 +200,16 @@ def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list
     page = folder / "report.html"
     page.unlink(missing_ok=True)  # of an earlier result
     if not args.no_report:
-        facts["report"] = str(
-            write_whole(page, render_servo_page(gap, str(args.model), target, numbers))
-        )
+        text = render_servo_page(gap, str(args.model), target, numbers)
+        facts["report"] = str(write_whole(page, text))
     _write(args, folder, facts)
     for line in servo_words.lines(gap):
-        output.print(Text.from_markup(line), soft_wrap=True)
+        terminal.output.print(Text.from_markup(line), soft_wrap=True)
     for line in (text for number in numbers for text in number.sentences()):
-        show(f"differs: {line}")
+        terminal.show(f"differs: {line}")
     if numbers and not any(number.odd for number in numbers):
-        show(f"{len(numbers)} numbers beside other arms: none differs beyond both doubts")
-    say(f"servos {target}")
+        terminal.show(f"{len(numbers)} numbers beside other arms: none differs beyond both doubts")
+    terminal.say(f"servos {target}")
     if not args.no_report:
-        show(f"report {page}")
+        terminal.show(f"report {page}")
     return 0

@@ -23,14 +23,15 @@ from drivers.errors import DriverError, NotReady
 class Command(NamedTuple):
     """What declares its options and may set `check`, one line of help, what carries it out.
 
-    `run_by` is loaded by name, after the command line was found right: most bring libraries that
-    take a second to load. Before that `begins`, filled with the arguments, says what is being done.
-    `tests/house` reads this table, too.
+    `run_by` (the function `run` in the file of the command's name where not given) is loaded by
+    name, after the command line was found right: most bring libraries that take a second to load.
+    Before that `begins`, filled with the arguments, says what is being done. `tests/house` reads
+    this table, too.
     """
 
     declare: Callable[[argparse.ArgumentParser], None]
     words: str
-    run_by: str
+    run_by: str = ""
     may_end: tuple[ExitCode, ...] = ()  # beside what every command may
     begins: str = ""
     simulates: bool = False  # whatever the arguments
@@ -40,70 +41,54 @@ COMMANDS = {  # in the order of --help
     "run": Command(
         run_options.declare,
         "learn live",
-        "adapter.cli.run:run",
-        tuple(ExitCode),
-        "learning live from {driver}, {duration:g} s",
+        may_end=tuple(ExitCode),
+        begins="learning live from {driver}, {duration:g} s",
     ),
     "plan": Command(
         run_options.declare_plan,
         "where run would move the arm",
-        "adapter.cli.plan:run",
-        (ExitCode.NOT_READY,),
-        "planning a motion for {driver}",
+        may_end=(ExitCode.NOT_READY,),
+        begins="planning a motion for {driver}",
     ),
     "excite": Command(
         run_options.declare_excite,
         "design a motion that teaches most, or that tells effects apart",
-        "adapter.cli.excite:run",
         begins="designing a motion for {robot}",
     ),
     "replay": Command(
         run_options.declare_replay,
         "learn from a recording",
-        "adapter.cli.replay:run",
-        (ExitCode.NOTHING_LEARNED, ExitCode.NOT_CONVERGED),
-        "learning from {logs}",
+        may_end=(ExitCode.NOTHING_LEARNED, ExitCode.NOT_CONVERGED),
+        begins="learning from {logs}",
     ),
     "gap": Command(
-        model_options.declare_gap,
-        "find what a model lacks",
-        "adapter.cli.gap:run",
-        begins="comparing {model} with {logs}",
+        model_options.declare_gap, "find what a model lacks", begins="comparing {model} with {logs}"
     ),
-    "effects": Command(
-        model_options.declare_effects,
-        "what can be named, and laws of one's own",
-        "adapter.cli.effects:run",
-    ),
+    "effects": Command(model_options.declare_effects, "what can be named, and laws of one's own"),
     "fleet": Command(
         model_options.declare_fleet,
         "one model per arm from many recordings",
-        "adapter.cli.fleet:run",
-        (ExitCode.NOTHING_LEARNED,),
-        "learning one model per arm from {logs}",
+        may_end=(ExitCode.NOTHING_LEARNED,),
+        begins="learning one model per arm from {logs}",
     ),
     "load": Command(
         model_options.declare_load,
         "what the hand carries, to type into the robot",
-        "adapter.cli.load:run",
         begins="weighing what the hand carries in {log}",
     ),
     "diff": Command(
         model_options.declare_diff,
         "two models of one arm, joint by joint",
-        "adapter.cli.diff:run",
         begins="comparing {first} with {second}",
     ),
     "discover": Command(
         model_options.declare_discover,
         "find the tree of a robot from the motion of its links",
-        "adapter.cli.discover:run",
         begins="looking for the tree of the robot in {log}",
     ),
     "sim": Command(
         sim.declare,
         "simulated hardware behind real wire protocols",
-        "adapter.cli.sim:run",
         begins="starting a simulated {arm} arm",
         simulates=True,
     ),
@@ -150,11 +135,7 @@ COMMANDS = {  # in the order of --help
         "adapter.experiments.benchmark:run",
         begins="timing the update beside its rivals",
     ),
-    "completion": Command(
-        completion.declare,
-        "what a shell needs to complete command lines",
-        "adapter.cli.completion:run",
-    ),
+    "completion": Command(completion.declare, "what a shell needs to complete command lines"),
 }
 
 
@@ -227,7 +208,8 @@ def _carry_out(command: Command, args: argparse.Namespace) -> int:
         begin(command.begins.format_map({key: _told(x) for key, x in vars(args).items()}))
     if command.simulates:
         optional.load("pybullet")
-    module, _, function = command.run_by.partition(":")
+    run_by = command.run_by or f"adapter.cli.{args.command}:run"
+    module, _, function = run_by.partition(":")
     return int(getattr(import_module(module), function)(args))
 
 

@@ -191,12 +191,7 @@ def declare_diff(parser: argparse.ArgumentParser) -> None:
     add("second", nargs="?", metavar="B", help="the same; without it A and its documentation")
     options.add_joints(parser)
     options.add_json(parser, or_output=True)
-    parser.set_defaults(check=_check_diff)
-
-
-def _check_diff(args: argparse.Namespace) -> None:
-    options.check_robot(args.first)
-    options.check_robot(args.second)
+    parser.set_defaults(check=lambda args: options.check_robot(args.first, args.second))
 
 
 DISCOVER_WORDS = {

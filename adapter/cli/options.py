@@ -150,16 +150,17 @@ def check_learning(args: argparse.Namespace) -> None:
         import_module(NAMES).check_learning(args)
 
 
-def check_robot(name: str | None) -> None:
+def check_robot(*names: str | None) -> None:
     """Refuse what is neither a known robot nor a file of one. Raises UsageError."""
-    if name is None or name in robot_names():
-        return
-    if Path(name).suffix.lower() == ".xacro":
-        urdf = f"{name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"
-        raise UsageError(f"{name}: is xacro; make a URDF of it: xacro {name} > {urdf}")
-    if Path(name).suffix.lower() not in (".urdf", ".xml", ".json"):
-        raise UsageError(f"no robot '{name}'; {choices(name, robot_names(), ROBOT_FILES)}")
-    check_files(Path(name))
+    for name in names:
+        if name is None or name in robot_names():
+            continue
+        if Path(name).suffix.lower() == ".xacro":
+            urdf = f"{name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"
+            raise UsageError(f"{name}: is xacro; make a URDF of it: xacro {name} > {urdf}")
+        if Path(name).suffix.lower() not in (".urdf", ".xml", ".json"):
+            raise UsageError(f"no robot '{name}'; {choices(name, robot_names(), ROBOT_FILES)}")
+        check_files(Path(name))
 
 
 def add_topic(parser: argparse.ArgumentParser) -> None:
@@ -194,25 +195,22 @@ def add_told(parser: argparse.ArgumentParser) -> None:
         dest="turn_or_zero",
         action="extend",
         default=[],
-        type=_turned,
+        type=lambda text: [(name, -1.0, 0.0) for name in names_in(text)],  # as `Told.joints`
         metavar="JOINT,...",
     )
-    add("--zero", dest="turn_or_zero", action="extend", type=_zeros, metavar="JOINT=RAD,...")
+    add(
+        "--zero",
+        dest="turn_or_zero",
+        action="extend",
+        type=lambda text: [(name, 1.0, rad) for name, rad in map(_joint_value, text.split(","))],
+        metavar="JOINT=RAD,...",
+    )
     add("--tau", choices=("gravity-compensated",))
     add("--trust-log", action="store_true")
     add("--tau-gain", action="append", metavar="G1,G2,...|fit")
     add("--gear", metavar="G1,G2,...")
     add("--known-load", type=float, metavar="KG")
     add("--loaded", nargs="+", action="extend", default=[], type=Path, metavar="LOG")
-
-
-def _turned(text: str) -> list[tuple[str, float, float]]:
-    """As `Told.joints` has them."""
-    return [(name, -1.0, 0.0) for name in names_in(text)]
-
-
-def _zeros(text: str) -> list[tuple[str, float, float]]:
-    return [(name, 1.0, zero_rad) for name, zero_rad in map(_joint_value, text.split(","))]
 
 
 def check_told(args: argparse.Namespace) -> None:

@@ -33,7 +33,6 @@ from drivers.ros2.settings import Ros2Settings, parse
 from drivers.ros2.wire import Network, Publication
 
 PREFIX = "/panda_adapter"
-GLOBAL = (TF_MOVING, TF_FIXED)
 
 
 def publisher_job(address: str, robot: SelfModel, effects: tuple[str, ...]) -> DisplayJob | None:
@@ -106,7 +105,7 @@ class Publisher:
             load = np.array([[message.fields["mass"], message.fields["mass_std"]]])
             fields = table_fields(("load", "mass,standard deviation"), load)
             message = message._replace(schema=FLOAT64_MULTI_ARRAY, fields=fields)
-        topic = message.topic if message.topic in GLOBAL else PREFIX + message.topic
+        topic = message.topic if message.topic in (TF_MOVING, TF_FIXED) else PREFIX + message.topic
         if topic not in self._publications:
             publish = self._network.publish(topic, message.schema, message.latched)
             self._publications[topic] = publish

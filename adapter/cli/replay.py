@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from rich.progress import Progress
 
@@ -61,10 +61,8 @@ def run(args: argparse.Namespace) -> int:
     numbers["torque_gains"] = None if gains is None else gains.as_dict()
     held_out = None if args.validate_from is None else replay.from_s(log, args.validate_from)
     if args.validate is not None:
-        other = read_log(
-            args.validate, topic=args.topic, beside="" if args.base is None else "frames"
-        )
-        other = _joined(args, other, robot)
+        frames: Literal["", "frames"] = "" if args.base is None else "frames"
+        other = _joined(args, read_log(args.validate, topic=args.topic, beside=frames), robot)
         held_out = told_of(args).log(other, robot, 1.0 if gains is None else gains.gain)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
@@ -87,13 +85,8 @@ def _figures(
     result: replay.Replay,
 ) -> dict[str, Any]:
     front_end = result.pipeline.front_end
-    course = Course(
-        result.samples,
-        front_end.refused,
-        front_end.first_moving_ns,
-        front_end.delay_s,
-        result.ticks.summary_us(),
-    )
+    taken = result.samples, front_end.refused, front_end.first_moving_ns
+    course = Course(*taken, front_end.delay_s, result.ticks.summary_us())
     return figures(
         result.outcome,
         robot,
@@ -131,10 +124,10 @@ def _as_told(
     told = told_of(args)
     if told.learn and robot.tree.floating:
         raise SettingsError("--tau-gain fit needs a fixed base; give --tau-gain G1,G2,...")
-    until = args.validate_from
     taught: list[Log] = []
     if told.learn:
         say("learning the gains of the drives")
+        until = args.validate_from
         taught = logs if until is None else [replay.from_s(x, 0.0, until) for x in logs]
     logs, gains = as_told(logs, robot, told, taught)
     if gains is not None:
@@ -154,10 +147,8 @@ def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:
 
 def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> replay.Replay:
     if args.validate_from is not None and not 0.0 < args.validate_from < replay.last_s(log):
-        raise SettingsError(
-            f"--validate-from {args.validate_from} is outside the recording "
-            f"(0 to {replay.last_s(log):.1f} s)"
-        )
+        span = f"(0 to {replay.last_s(log):.1f} s)"
+        raise SettingsError(f"--validate-from {args.validate_from} is outside the recording {span}")
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("learning", total=len(log))
         options = replay.ReplayOptions(

@@ -13,7 +13,7 @@ from functools import partial
 from glob import escape
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from adapter import optional
 from adapter.cli.agreement import agree, need_somebody, reading
@@ -44,21 +44,13 @@ from adapter.realtime.jobs import Jobs, RecordingJob
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.realtime.run_messages import ShownArm
 from adapter.realtime.showing import DisplayJob
+from adapter.runs import terminal
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines, contacts_of
 from adapter.runs.live import learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
-from adapter.runs.terminal import (
-    complain,
-    console,
-    program_version,
-    results_folder,
-    say,
-    show,
-    warn,
-)
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.matching import counted, present
 from adapter.view.foxglove_view import free_port, need_foxglove
@@ -70,19 +62,12 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import joint_count, maybe_real, open_driver, split_address
 
+if TYPE_CHECKING:
+    from adapter.cli.simulated import Simulation
+
 DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
-
-
-class SimulationLike(Protocol):
-    """A simulated arm (`adapter.cli.simulated.Simulation`)."""
-
-    scenario: Any
-    asked_for: bool
-
-    def driver(self, rest: str) -> Driver:
-        """What opens it."""
-        ...
+AS_TOLD = ("set_aside", "skipped", "restarts", "recorded", "unrecorded", "tracking")  # by the loop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +85,7 @@ class RunPlan:
 
     robot: SelfModel
     config: Config
-    world: SimulationLike | None
+    world: Simulation | None
     maybe_real: bool
     feedforward: str
 
@@ -140,7 +125,7 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     elif scheme == "log":
         names = read_log(rest).joint_names
     robot, locked = present(robot, names, args.driver)
-    warn(locked)
+    terminal.warn(locked)
     config = with_motion(args, configure(args, None, robot))
     if world is not None and world.scenario.imus:
         pipeline = with_imus(config.pipeline, world.scenario.imus)
@@ -166,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
     config, robot = plan.config, plan.robot
     if plan.maybe_real and _may_move(args):
         need_somebody(args.yes)
-    folder = results_folder(args.out, "run")
+    folder = terminal.results_folder(args.out, "run")
     truth = args.truth
     if truth is None and plan.world is not None:
         plan.world.scenario.write_truth(folder / "truth.json")
@@ -178,23 +163,24 @@ def run(args: argparse.Namespace) -> int:
         driver = with_faults(driver, args.fault, args.seed or 0)
     if plan.maybe_real and not driver.can_move:
         if _may_move(args):
-            warn(["--allow-motion changes nothing here: this driver only listens"])
+            terminal.warn(["--allow-motion changes nothing here: this driver only listens"])
         else:
-            say("only listening; --allow-motion lets the arm move")
-    compile_first(robot, config.pipeline, 1, say)
+            terminal.say("only listening; --allow-motion lets the arm move")
+    compile_first(robot, config.pipeline, 1, terminal.say)
     front_end = make_front_end(robot, config.pipeline)
     result = _go(args, plan, driver, front_end, folder, truth)
     if isinstance(driver, FaultyDriver):
-        show(driver.account.line())
+        terminal.show(driver.account.line())
     notes = [] if result.tracking is None else result.tracking["notes"]
-    warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes + notes)
+    fault = [result.fault] if result.fault else []
+    terminal.warn([*fault, *result.troubles, *result.intake.notes, *notes])
     if result.unrecorded:
         share = 100.0 * result.unrecorded / result.samples
-        warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
+        terminal.warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
     if result.collected is None:
         for line in _accounts(result):
-            show(line)
-        complain("the learner ended early")
+            terminal.show(line)
+        terminal.complain("the learner ended early")
         return ExitCode.LEARNER_FAILED
     _conclude(args, folder, plan, reference, front_end, result)
     if result.fault:
@@ -256,15 +242,16 @@ def _go(
     # without a terminal (a pipe, CI) there is no table, and who has something to say says it
     publisher = publisher_job(args.driver, robot, effects)
     display = None
-    if console.is_terminal and not args.quiet:
+    if terminal.console.is_terminal and not args.quiet:
         display = DisplayJob(partial(LiveTable, known), says=True)
 
     later: list[Callable[[], Path] | None] = []
 
     def before_motion(stopped: Callable[[], bool]) -> None:
-        warn(driver.intake.notes)  # who holds the arm, say; again with what came later at the end
+        # who holds the arm, say; again with what came later at the end
+        terminal.warn(driver.intake.notes)
         if controller is None:
-            warn(filter(None, [another_robot(driver, MotionLimits.of(robot))]))
+            terminal.warn(filter(None, [another_robot(driver, MotionLimits.of(robot))]))
         elif maybe_real:
             later.append(agree(args, driver, controller, duration_s, folder, stopped))
 
@@ -280,14 +267,9 @@ def _go(
         watching = FollowingObserver(observer, safety.stop_at_contact, names)
         if controller is not None:
             controller.observer = observer
-    result = run_live(
-        driver,
-        front_end,
-        controller,
-        Jobs(learner, recording, display, together([_view_job(args, known), publisher])),
-        LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
-        say=say,
-    )
+    jobs = Jobs(learner, recording, display, together([_view_job(args, known), publisher]))
+    options = LiveOptions(duration_s, deadman, before_motion=before_motion, observer=watching)
+    result = run_live(driver, front_end, controller, jobs, options, say=terminal.say)
     for write in filter(None, later):
         write()
     if watching is None:
@@ -306,10 +288,10 @@ def _view_job(args: argparse.Namespace, known: KnownRun) -> DisplayJob | None:
     if args.foxglove is not None:
         need_foxglove()
         port = free_port(args.foxglove)
-        say(f"Foxglove, PlotJuggler: ws://{HOST}:{port}")
+        terminal.say(f"Foxglove, PlotJuggler: ws://{HOST}:{port}")
     if args.view is not None:
         listening = bind(None if args.view == ANY else args.view)
-        say(f"watch it: {address(listening)}")
+        terminal.say(f"watch it: {address(listening)}")
     if listening is None and port is None:
         return None
     make = partial(make_view, known, listening, port)
@@ -340,14 +322,9 @@ def _recording(
     args: argparse.Namespace, plan: RunPlan, driver: Driver, folder: Path, truth: Path | None
 ) -> RecordingJob:
     """The recording, with all that a replay needs to repeat the run."""
-    metadata = recording_metadata(
-        plan.config,
-        plan.robot,
-        shlex.join(sys.argv[1:]),
-        driver=args.driver,
-        scenario=args.scenario,
-        commands_without_gravity=driver.adds_gravity,
-    )
+    how = {"driver": args.driver, "scenario": args.scenario}
+    how["commands_without_gravity"] = driver.adds_gravity
+    metadata = recording_metadata(plan.config, plan.robot, shlex.join(sys.argv[1:]), **how)
     attachments = {"documented.json": dumps(plan.robot).encode()}
     if truth is not None:
         attachments["truth.json"] = truth.read_bytes()
@@ -371,19 +348,13 @@ def _conclude(
     lost = result.unlearned + result.passed_on - outcome.learned
     if lost:
         refused["not_reached_learner"] = lost
+    taken = result.samples, refused, front_end.first_moving_ns, front_end.delay_s
+    slow_s = 0.0 if result.tracking is None else plan.config.excitation.slow_s
     numbers = figures(
         outcome,
         robot,
         reference,
-        Course(
-            result.samples,
-            refused,
-            front_end.first_moving_ns,
-            front_end.delay_s,
-            result.timing.tick_us,
-            result.timing.missed_deadlines,
-            0.0 if result.tracking is None else plan.config.excitation.slow_s,
-        ),
+        Course(*taken, result.timing.tick_us, result.timing.missed_deadlines, slow_s),
         warnings=[
             *front_end.messages,
             *result.troubles,
@@ -397,18 +368,13 @@ def _conclude(
         driver=args.driver,
         recordings=[] if args.no_record else [_recording_path(args, folder)],
         scenario=args.scenario,
-        program=f"panda-adapter {program_version()}",
+        program=f"panda-adapter {terminal.program_version()}",
         timing=result.timing.as_dict(),
         granted=result.grants,
         ended=result.ended,
         fault=result.fault,
         intake=result.intake.as_dict(),
-        set_aside=result.set_aside,
-        skipped=result.skipped,
-        restarts=result.restarts,
-        recorded=result.recorded,
-        unrecorded=result.unrecorded,
-        tracking=result.tracking,
+        **{key: getattr(result, key) for key in AS_TOLD},
         feedforward=plan.feedforward,
     )
     learned = Learned(outcome, robot, reference, front_end, _accounts(result))

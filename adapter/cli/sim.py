@@ -57,10 +57,8 @@ def _check(args: argparse.Namespace) -> None:
     """The arm's own options. Raises ValueError, DriverError with the choices."""
     served = ARMS[args.arm]
     options = import_module(own_name(served.options))
-    parser = Parser(
-        prog=f"adapter sim {args.arm}",
-        description=f"Serve {served.words}, until SIGTERM or Ctrl-C.",
-    )
+    said = f"Serve {served.words}, until SIGTERM or Ctrl-C."
+    parser = Parser(prog=f"adapter sim {args.arm}", description=said)
     options.add_arguments(parser)
     args.asked = parser.parse_args(args.rest)
     options.check(args.asked)

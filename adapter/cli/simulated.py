@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.settings import BusSettings
@@ -32,12 +33,9 @@ class Simulation:
         if not self.address.startswith("can:"):
             return SimulatedArm(self.scenario.plant())
         names = self.scenario.truth.joint_names
+        arm = partial(DamiaoArm, self.address, names, allow_motion=True)
         channel = BusSettings.of(self.address, names).channel
-        return InProcess(
-            channel,
-            self.scenario,
-            lambda bus: DamiaoArm(self.address, names, allow_motion=True, bus=bus),
-        )
+        return InProcess(channel, self.scenario, lambda bus: arm(bus=bus))
 
 
 def simulation(address: str, scenario: str | None, options: list[str], seed: int) -> Simulation:

@@ -37,7 +37,6 @@ RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an 
 START_REACH = 0.02  # rad, further from where the motion was drawn from it does not start
 FADE_S = 1.0  # from feedback alone to feed-forward
 REFRESH_TICKS = 50
-CARRY_TICKS = 20  # between two looks at what carries the arm
 
 
 @dataclass(frozen=True)
@@ -261,7 +260,7 @@ class ExcitationController:
                 self._listen(self.observer)
             else:
                 now[5] = model(ref.q, ref.dq, ref.ddq)
-            if self._ticks % CARRY_TICKS == 0:
+            if self._ticks % 20 == 0:  # between two looks at what carries the arm
                 self._tell_weight(model.unbent(ref.q), ref.q)
         self._tau = watch.step(most, 1e-9 * min(step_ns, 2 * self._period_ns))
         return self._tau.copy()

@@ -1,7 +1,6 @@
 """Smooth random motion that shows an arm its body: inside all limits, never repeating.
 
-The limits hold for all time
-because they hold for the sums of |a_i| w_i^k.
+The limits hold for all time because they hold for the sums of |a_i| w_i^k.
 
 `plan_lines` says what an arm is about to do, for the person beside it.
 """
@@ -64,9 +63,14 @@ class RandomMotion(SineMotion):
         low, high = np.log(edges[:-1]), np.log(edges[1:])
         self.omega = 2.0 * np.pi * np.exp(low + (high - low) * rng.random(shape))
         relative = (0.5 + rng.random(shape)) / self.omega  # alike in speed, not in position
-        factor = size * _scale(relative, self.omega, limits, lower, upper, s)
-        factor = factor * moving(limits, s)
-        speed, reach = (relative * self.omega).sum(axis=1), relative.sum(axis=1)
+        # speed, acceleration and jerk of the path are at most the sums of |a_i| w_i^k
+        reach, speed, acceleration, jerk = (
+            (relative * self.omega**k).sum(axis=1) for k in range(4)
+        )
+        allowed = np.array([limits.velocity, limits.acceleration, limits.jerk])
+        wanted = s.share * (allowed / ramped(speed, acceleration, jerk, s))
+        room = s.range_share * 0.5 * (upper - lower)
+        factor: Array = size * np.minimum(room / reach, wanted.min(axis=0)) * moving(limits, s)
 
         def centre(factor: Array) -> Array:
             return np.minimum(np.maximum(q0, lower + factor * reach), upper - factor * reach)
@@ -87,26 +91,6 @@ class RandomMotion(SineMotion):
         )
         bounds = ramped(speed, acceleration, jerk, self.settings)
         return self.centre - reach, self.centre + reach, *bounds
-
-
-def _scale(
-    relative: Array,
-    omega: Array,
-    limits: MotionLimits,
-    lower: Array,
-    upper: Array,
-    settings: ExcitationSettings,
-) -> Array:
-    """Factor (n,) on the amplitudes with which every limit holds for all time.
-
-    Speed, acceleration and jerk of the path are at most the sums of |a_i| w_i^k.
-    """
-    reach, speed, acceleration, jerk = ((relative * omega**k).sum(axis=1) for k in range(4))
-    room = settings.range_share * 0.5 * (upper - lower)
-    allowed = np.array([limits.velocity, limits.acceleration, limits.jerk])
-    wanted = settings.share * (allowed / ramped(speed, acceleration, jerk, settings))
-    factor: Array = np.minimum(room / reach, wanted.min(axis=0))
-    return factor
 
 
 def _phases_through(phase: Array, amplitude: Array, start: Array) -> Array:
@@ -159,7 +143,7 @@ def plan_lines(
         )
     for j, name in enumerate(joint_names):
         low, high = limits.lower[j], limits.upper[j]
-        unit = "m" if limits.is_sliding(j) else "rad"
+        unit = "m" if any(limits.slides[j : j + 1]) else "rad"
         room = "its limits are not documented"
         if np.isfinite(low) and np.isfinite(high):
             margin = min(lower[j] - low, high - upper[j])

@@ -208,7 +208,11 @@ class ModelFeedforward(Feedforward):
         links[0, 0], links[1, 0], links[2, 0] = at.q, at.dq, at.ddq
         straight = self._rigid()
         if known.moves:
-            self._to_links(known)
+            (q,), (dq,), (ddq,), (tau,) = self._links  # the links' motion for the encoders'
+            lag = known.half_play * smooth_sign(dq)
+            pull = JointTorques(tau, self._still, self._still)
+            to_links(JointMotion(q, dq, ddq), pull, Gears.of(known))
+            q -= lag
         rigid, (q, dq, ddq) = self._rigid(), links[:3, 0]
         more = rigid - straight + known.torque(JointSignals(q, dq, ddq, rigid, bent=at.bent))
         if known.pushed:
@@ -221,14 +225,6 @@ class ModelFeedforward(Feedforward):
         tau = self._links[3]
         torques(self.frames, self.theta, JointMotion(*self._links[:3]), self._base[None], tau)
         return tau[0].copy()
-
-    def _to_links(self, known: ByJoint) -> None:
-        """Put the links' motion in place of what the encoders say."""
-        (q,), (dq,), (ddq,), (tau,) = self._links
-        lag = known.half_play * smooth_sign(dq)
-        pull = JointTorques(tau, self._still, self._still)
-        to_links(JointMotion(q, dq, ddq), pull, Gears.of(known))
-        q -= lag
 
 
 def _shares_of_effect(effect: LearnedEffect) -> Array | None:

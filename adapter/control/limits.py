@@ -69,10 +69,6 @@ class MotionLimits:
             model.tree.slides,
         )
 
-    def is_sliding(self, joint: int) -> bool:
-        """Whether a joint (from 0) slides."""
-        return bool(self.slides) and self.slides[joint]
-
     @property
     def robot(self) -> str:
         """Name of the arm where it is known; empty elsewhere."""

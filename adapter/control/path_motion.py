@@ -18,6 +18,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
@@ -209,19 +210,8 @@ def ramp_pairs(settings: ExcitationSettings) -> Array:
         rate = np.outer(first, value)
         bend = np.outer((1.0 - slow) * slope, value) + np.outer(first, slope)
         found += zip((rate**2).ravel(), (bend / ramp).ravel(), strict=True)
-    pairs, kept = np.array(found), list[Array]()  # those largest in some direction are enough
-    for pair in pairs[np.lexsort((-pairs[:, 1], -pairs[:, 0]))]:  # falling first parts
-        if kept and pair[1] <= kept[-1][1]:
-            continue
-        while len(kept) > 1 and _turns(kept[-2], kept[-1], pair) <= 0.0:
-            kept.pop()
-        kept.append(pair)
-    return np.array(kept)
-
-
-def _turns(a: Array, b: Array, c: Array) -> float:
-    """Above zero where a -> b -> c turns to the left."""
-    return float((b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0]))
+    pairs = np.array(found)
+    return np.asarray(pairs[ConvexHull(pairs).vertices])
 
 
 def largest(factor: Array, allowed: Callable[[Array], Array]) -> Array:

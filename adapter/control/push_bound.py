@@ -15,7 +15,6 @@ from adapter.physics.kernels import frames_of, place_frames
 
 POSES, DIRECTIONS = 40, 200  # that are looked at
 LOOKED_S = 30.0  # of path
-NO_PUSH_N = 1e4  # what hardly any joint feels
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # spreads directions evenly over a sphere
 # Of the effort limit, and N m: what a stopped arm may still push with on each joint. A CAN arm is
 # carried with a tenth of it beyond its weight (`resting`); half of that for what it sags by.
@@ -46,7 +45,7 @@ class PushBound:
     def lines(self) -> list[str]:
         """For the person beside the arm."""
         worst = f"{self.most:.0f} N for the worst"
-        if not self.most < NO_PUSH_N:
+        if not self.most < 1e4:  # what hardly any joint feels
             worst = "no push does in the worst"
         each, left = (", ".join(f"{x:.3g}" for x in row) for row in (self.joints, self.left))
         return [

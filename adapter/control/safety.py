@@ -79,15 +79,6 @@ _WHAT = {
 
 
 @jit
-def limit_push(now, limits):
-    """How much push is too much: less where a learned model knows well what to expect."""
-    for j in range(now.shape[1]):
-        std, most = now[Now.STD.value, j], limits[MOST, j]
-        least = max(limits[LEAST, j], SIGMAS * std)
-        limits[Cause.EXTERNAL.value, j] = min(most, least) if std > 0.0 else most
-
-
-@jit
 def find_push(now, limit, follow):
     """Fill `EXTERNAL` and follow `OFFSET` by this share; False where there is no model."""
     calm = True
@@ -165,7 +156,10 @@ def look(now, limits, times, bounds, numbers):
 
     `bounds` (3, n): room, most, step; `numbers`: hold_s, dt_s, share that the offset follows by.
     """
-    limit_push(now, limits)
+    for j in range(now.shape[1]):  # less push is too much where a learned model knows well
+        std, most = now[Now.STD.value, j], limits[MOST, j]
+        least = max(limits[LEAST, j], SIGMAS * std)
+        limits[Cause.EXTERNAL.value, j] = min(most, least) if std > 0.0 else most
     modelled = find_push(now, limits[Cause.EXTERNAL.value], numbers[2])
     cut, quick = command(now, bounds[0], bounds[1], bounds[2], modelled)
     cause, joint, calm = judge(now, limits, times, numbers[0], numbers[1])

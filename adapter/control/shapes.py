@@ -36,7 +36,6 @@ from drivers.files.bounded import read_bytes
 
 FORMATS = ".stl, .obj"
 MOST_TRIANGLES = 200_000  # some 30 MB with the search tree over them
-MOST_BYTES = 2**25  # of a file
 INTEGER_DIGITS = 12  # of a corner's number; what is longer is none
 FURTHEST_M = 100.0  # from the mesh's origin; what is larger was drawn in millimetres
 HEADER_BYTES, RECORD = 80, np.dtype([("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("more", "<u2")])
@@ -66,7 +65,7 @@ def read_mesh(path: str | Path, scale: tuple[float, ...] = (1.0,)) -> Mesh:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        content = read_bytes(path, MOST_BYTES)
+        content = read_bytes(path, 2**25)  # of a file
         if path.suffix.lower() == ".stl":
             corners, triangles = _stl(content)
         elif path.suffix.lower() == ".obj":

@@ -23,7 +23,7 @@ RAMP_S, HOLD_S, FIRST_REST_S = 0.3, 2.0, 1.0
 # Largest slope and bend of the quintic step over one second.
 STEP_SLOPE, STEP_BEND = 1.875, 5.78
 FAR, NARROW = 0.2, 0.02  # rad that a joint is moved to one side
-SLOW, USUAL, WIDE = 0.01, 0.1, 0.2  # rad/s
+WIDE = 0.2  # rad/s
 RATES = (0.01, 0.03, 0.1, 0.3, 0.5)
 
 
@@ -39,29 +39,18 @@ def _there_and_back(far: float, speeds: Sequence[float], hold_s: float = 0.0) ->
     return [Move(sign * far, v, hold_s) for v in speeds for sign in (1.0, -1.0)]
 
 
-def _speeds(up: float, down: float) -> list[Move]:
-    return _there_and_back(_side(up, down, FAR), RATES)
-
-
-def _still(up: float, down: float) -> list[Move]:
-    return _there_and_back(0.5 * _side(up, down, FAR), [USUAL] * 3, HOLD_S)
-
-
-def _turns(up: float, down: float) -> list[Move]:
-    return _there_and_back(_side(up, down, NARROW), [SLOW] * 3)
-
-
 def _side(up: float, down: float, most: float) -> float:
     """Towards where there is more room."""
     return min(up, most) if up >= down else -min(down, most)
 
 
 MOVES: dict[DecidingExperiment, Callable[[float, float], list[Move]]] = {
-    SPEEDS: _speeds,
-    BOTH_WAYS: _speeds,
-    STILL: _still,
+    **dict.fromkeys(
+        (SPEEDS, BOTH_WAYS), lambda up, down: _there_and_back(_side(up, down, FAR), RATES)
+    ),
+    STILL: lambda up, down: _there_and_back(0.5 * _side(up, down, FAR), [0.1] * 3, HOLD_S),
     TURN: lambda up, down: [Move(up, WIDE), Move(-up - down, WIDE), Move(down, WIDE)],
-    TURNS: _turns,
+    TURNS: lambda up, down: _there_and_back(_side(up, down, NARROW), [0.01] * 3),
 }
 
 

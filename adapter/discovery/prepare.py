@@ -30,15 +30,6 @@ GAP_S = 0.05  # a longer silence of a sensor is not bridged
 RESTING = 0.02  # rad/s, a joint slower than this counts as resting
 ENCODER_STEP = 2.0 * np.pi / 2**14  # rad, coarser than any encoder at a joint of today
 
-_ASSUMED_REST = (
-    "no angular velocity of links {names} is recorded; it is added up from their angular "
-    "acceleration, all links taken to be at rest at the start"
-)
-_FOUND_START = (
-    "no angular velocity of links {names} is recorded; it is added up from their angular "
-    "acceleration, and what it was at the start is found from the joints' speeds"
-)
-
 
 @dataclass(frozen=True)
 class PreparedLog:
@@ -114,8 +105,13 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> PreparedLog:
     moving = float(np.abs(dq[: 2 * through.edge]).max()) > RESTING
     notes = channels.notes
     if without_w.any():
-        sentence = _FOUND_START if moving else _ASSUMED_REST
-        notes = (*notes, sentence.format(names=listed(log.link_names, without_w)))
+        start = (
+            "and what it was at the start is found from the joints' speeds"
+            if moving
+            else "all links taken to be at rest at the start"
+        )
+        told = f"no angular velocity of links {listed(log.link_names, without_w)} is recorded"
+        notes = (*notes, f"{told}; it is added up from their angular acceleration, {start}")
     return PreparedLog(
         joint_names=log.joint_names,
         link_names=log.link_names,

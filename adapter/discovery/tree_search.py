@@ -18,6 +18,7 @@ from itertools import count
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import shortest_path
 
 from adapter.discovery.bodies import NO_JOINT, Bodies
 from adapter.discovery.hypotheses import FREE, LOST, Option
@@ -223,7 +224,11 @@ def central(search: TreeSearch, bodies: Bodies, structure: Structure) -> Structu
     tied = [k for k, share in shares.items() if share >= max(shares.values()) * np.exp(-TIED)]
     if len(tied) < 2:
         return structure
-    distance = _distances(structure)
+    joined = np.zeros((len(structure.chosen), len(structure.chosen)))
+    for option in structure.chosen:
+        if 0 <= option.parent < len(joined):
+            joined[option.link, option.parent] = 1.0
+    distance = shortest_path(joined, directed=False)  # joints between any two links
     best = min(tied, key=lambda k: (sum(distance[k, i] for i in shares), k))
     return search.rooted_at(best)[0] or structure
 
@@ -234,16 +239,3 @@ def component(structure: Structure, root: int) -> list[int]:
     for link in members:
         members += [option.link for option in structure.chosen if option.parent == link]
     return members
-
-
-def _distances(structure: Structure) -> np.ndarray:
-    """Joints between any two links, (links, links); many where no path leads."""
-    n = len(structure.chosen)
-    out = np.full((n, n), 2 * n)
-    np.fill_diagonal(out, 0)
-    for option in structure.chosen:
-        if 0 <= option.parent < n:
-            out[option.link, option.parent] = out[option.parent, option.link] = 1
-    for k in range(n):
-        out = np.minimum(out, out[:, k, None] + out[None, k])
-    return out

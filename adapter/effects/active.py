@@ -9,17 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import (
-    ALL,
-    JOINT,
-    LINK,
-    Array,
-    BodyEffect,
-    Effect,
-    Flags,
-    Parameter,
-    Values,
-)
+from adapter.effects import base
 from adapter.effects.by_joint import ByJoint
 from adapter.effects.catalogue import CATALOGUE, KNOWN
 from adapter.effects.law import Law
@@ -44,13 +34,13 @@ class Active:
         std: of the parameters, None where unknown.
     """
 
-    effect: Effect
+    effect: base.Effect
     joint: int
-    values: Values
+    values: base.Values
     interval_s: tuple[float, float] = WHOLE
     std: Mapping[str, float | None] = field(default_factory=dict)
 
-    def on(self, t: Array) -> Flags | None:
+    def on(self, t: base.Array) -> base.Flags | None:
         """(m,) where it acts; None where it always does."""
         if self.interval_s == WHOLE:
             return None
@@ -111,7 +101,7 @@ def with_bodies(model: SelfModel) -> SelfModel:
     n, theta, gravity, kept = model.tree.n, model.theta.copy(), model.gravity, []
     for entry in model.effects:
         for active in active_effects([entry], n):
-            if not (isinstance(active.effect, BodyEffect) and active.lasting):
+            if not (isinstance(active.effect, base.BodyEffect) and active.lasting):
                 kept.append(entry)
                 break
             links, gravity = active.effect.body(theta[-n:], gravity, active.joint, active.values)
@@ -160,11 +150,11 @@ def _of_entry(entry: Any, n: int) -> list[Active]:
     return found
 
 
-def _keys(effect: Effect) -> str:
+def _keys(effect: base.Effect) -> str:
     return ", ".join(f"'{p.key}'" for p in effect.parameters)
 
 
-def _joints(effect: Effect, joints: Any, n: int) -> list[int]:
+def _joints(effect: base.Effect, joints: Any, n: int) -> list[int]:
     """The joints that the effect has for its own; none for one of the flange, the base or all."""
     given = [] if joints is None else joints
     if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
@@ -172,12 +162,12 @@ def _joints(effect: Effect, joints: Any, n: int) -> list[int]:
     for j in given:
         if isinstance(j, bool) or not isinstance(j, int | np.integer) or not 1 <= j <= n:
             raise ModelError(f"{effect.name}: no joint {j!r}; have: 1 to {n}")
-    if effect.scope in (JOINT, LINK) and not len(given):
+    if effect.scope in (base.JOINT, base.LINK) and not len(given):
         raise ModelError(f"{effect.name} needs 'joints'; have: 1 to {n}")
-    return [int(j) for j in given] if effect.scope in (JOINT, LINK, ALL) else []
+    return [int(j) for j in given] if effect.scope in (base.JOINT, base.LINK, base.ALL) else []
 
 
-def _interval(effect: Effect, entry: Mapping[str, Any]) -> tuple[float, float]:
+def _interval(effect: base.Effect, entry: Mapping[str, Any]) -> tuple[float, float]:
     """(from, to) in s; infinite where the entry leaves an end open."""
     given = entry.get("interval_s")
     if given is None:
@@ -194,9 +184,9 @@ def _interval(effect: Effect, entry: Mapping[str, Any]) -> tuple[float, float]:
     return found
 
 
-def _of_joint(effect: Effect, key: str, value: Any, k: int, joints: int) -> Any:
+def _of_joint(effect: base.Effect, key: str, value: Any, k: int, joints: int) -> Any:
     """A parameter of the k-th joint: entries may hold one value for each."""
-    parameter: Parameter | None = next((p for p in effect.parameters if p.key == key), None)
+    parameter: base.Parameter | None = next((p for p in effect.parameters if p.key == key), None)
     if parameter is None or np.ndim(value) == (0 if parameter.count == 1 else 1):
         return value
     if not hasattr(value, "__len__") or len(value) != joints:

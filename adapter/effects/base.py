@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, wraps
-from typing import Any, ClassVar, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +29,16 @@ from adapter.model.spatial import Array
 from adapter.model.urdf_text import NO_PLACE, Additions
 from drivers.errors import choices
 
+if TYPE_CHECKING:  # brings numba: the catalogue is read by who needs none
+    from adapter.physics.rigid_arm import RigidArm as ArmDynamics
+else:
+    ArmDynamics = Any
+
 Flags = NDArray[np.bool_]
 Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 SMOOTH_HZ = 10.0  # low-pass of motions whose torques are compared as they are
-RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
 EVEN, PAUSE_STEPS = 1e-3, 10  # share of a step by which even ones differ; most that a pause is
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
@@ -92,30 +96,6 @@ class Parameter:
     def nearest(self, value: float) -> float:
         """The value, or the bound that it lies beyond."""
         return min(max(value, self.lower), self.upper)
-
-
-class ArmDynamics(Protocol):
-    """The rigid body that an effect acts on; see `physics.rigid_arm.RigidArm`."""
-
-    @property
-    def n(self) -> int: ...
-
-    @property
-    def theta(self) -> Array: ...
-
-    @property
-    def gravity(self) -> Array: ...
-
-    @property
-    def slides(self) -> tuple[bool, ...]: ...
-
-    def changed(self, theta: Array | None = None, gravity: Array | None = None) -> ArmDynamics: ...
-
-    def torque(self, q: Array, dq: Array, ddq: Array) -> Array: ...
-
-    def regressor(self, q: Array, dq: Array, ddq: Array) -> Array: ...
-
-    def wrench_torque(self, q: Array, wrench: Array) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +166,7 @@ class Motion:
         def below(even: Array, step: float) -> Array:
             if not band_hz * step < 0.5:
                 return even
-            low_pass = _low_pass(band_hz, round(1.0 / step, RATE_DIGITS))
+            low_pass = _low_pass(band_hz, round(1.0 / step, 3))
             return np.asarray(sosfiltfilt(low_pass, even))
 
         return self._evenly(x, below)
@@ -230,11 +210,7 @@ def late_jit(function: Kernel) -> Kernel:
 
         return njit(cache=True, error_model="numpy")(function)
 
-    @wraps(function)
-    def call(*args: Any) -> Any:
-        return compiled()(*args)
-
-    return cast(Kernel, call)
+    return cast(Kernel, wraps(function)(lambda *args: compiled()(*args)))
 
 
 @late_jit
@@ -609,9 +585,7 @@ class LinearEffect(LearnedEffect, JointTorque):
         """The one column."""
         return (self.column(at),)
 
-    def columns(self, at: JointSignals) -> tuple[Array, ...]:
-        """The one column."""
-        return (self.column(at),)
+    columns = basis
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Parameter times column."""

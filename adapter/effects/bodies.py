@@ -7,18 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import (
-    BASE,
-    BODY_STD,
-    FLANGE,
-    LINK,
-    Array,
-    BodyEffect,
-    Motion,
-    Parameter,
-    TorqueEffect,
-    Values,
-)
+from adapter.effects import base as base
 from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import ALONE, BARE, LEVELLED, LOADS, WEIGHED, Length, Phrase
 from adapter.model.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
@@ -26,7 +15,7 @@ from adapter.model.spatial import exp_rotation
 from adapter.model.urdf_text import NO_PLACE, Additions
 
 
-class Payload(BodyEffect):
+class Payload(base.BodyEffect):
     """A rigid body that the last link carries, in that link's frame.
 
     Mass, centre and, where given, inertia about it.
@@ -34,15 +23,15 @@ class Payload(BodyEffect):
 
     name = "payload"
     title = "payload"
-    scope = FLANGE
+    scope = base.FLANGE
     parameters = (
-        Parameter("m", "kg"),
-        Parameter("cx", "m"),
-        Parameter("cy", "m"),
-        Parameter("cz", "m"),
-        Parameter("inertia", "kg m2", count=6, optional=True),
+        base.Parameter("m", "kg"),
+        base.Parameter("cx", "m"),
+        base.Parameter("cy", "m"),
+        base.Parameter("cz", "m"),
+        base.Parameter("inertia", "kg m2", count=6, optional=True),
     )
-    prior_std = BODY_STD
+    prior_std = base.BODY_STD
     positive = ("m",)
     phrase = Phrase(
         "the flange carries {x}", "m", "the flange carries {x} less than the model says"
@@ -52,67 +41,71 @@ class Payload(BodyEffect):
     watched = True
     is_theta = True
 
-    def decode(self, x: Array) -> dict[str, Any]:
+    def decode(self, x: base.Array) -> dict[str, Any]:
         """Of ten inertial parameters."""
         return parameters_of(x)
 
-    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
+    def body(
+        self, theta: base.Array, gravity: base.Array, joint: int, values: base.Values
+    ) -> tuple[base.Array, base.Array]:
         """The last link with the body."""
         changed = theta.copy()
         changed[-1] += theta_of(values)
         return changed, gravity
 
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
         """A body of its own where it can be one."""
         alone = more.carry(theta_of(values))
         return None if alone else "it has no inertia that could be a body's; the last link has it"
 
 
-def theta_of(values: Values) -> Array:
+def theta_of(values: base.Values) -> base.Array:
     """Ten parameters (10,) of a payload about the link's origin."""
     com = np.array([values["cx"], values["cy"], values["cz"]], dtype=float)
     tensor = tensor_from_six(np.asarray(values.get("inertia", np.zeros(6)), dtype=float))
     return np.asarray(theta_from_body(float(values["m"]), com, tensor))
 
 
-def parameters_of(theta: Array) -> dict[str, Any]:
+def parameters_of(theta: base.Array) -> dict[str, Any]:
     """Payload parameters of ten inertial ones (10,)."""
     m, com, tensor = body_from_theta(theta)
     keys = dict(zip(("cx", "cy", "cz"), map(float, com), strict=True))
     return {"m": float(m), **keys, "inertia": [float(x) for x in six_from_tensor(tensor)]}
 
 
-class LinkInertia(BodyEffect):
+class LinkInertia(base.BodyEffect):
     """A link that weighs something else: its θ differs by dtheta (order of eq. 4b)."""
 
     name = "link_inertia"
     title = "wrong link inertia"
-    scope = LINK
-    parameters = (Parameter("dtheta", "kg, kg m, kg m2", count=10),)
-    prior_std = BODY_STD
+    scope = base.LINK
+    parameters = (base.Parameter("dtheta", "kg, kg m, kg m2", count=10),)
+    prior_std = base.BODY_STD
     log_odds = -2.0
     phrase = Phrase("{who} {has} other inertias than the model says ({torque})")
     shows = ((WEIGHED, "shows"),)
     steady = True  # what a link gains while it moves is a load
     is_theta = True
 
-    def decode(self, x: Array) -> dict[str, Any]:
+    def decode(self, x: base.Array) -> dict[str, Any]:
         """Of ten inertial parameters."""
         return {"dtheta": [float(value) for value in x]}
 
-    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
+    def body(
+        self, theta: base.Array, gravity: base.Array, joint: int, values: base.Values
+    ) -> tuple[base.Array, base.Array]:
         """Link `joint` with its change."""
         changed = theta.copy()
         changed[joint] += np.asarray(values["dtheta"], dtype=float)
         return changed, gravity
 
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
         """Part of the link."""
         more.dtheta[joint] += np.asarray(values["dtheta"], dtype=float)
         return None
 
 
-class BaseTilt(BodyEffect):
+class BaseTilt(base.BodyEffect):
     """A base that does not stand as the model says: gravity in the base is R(r)^T g.
 
     r is the rotation vector [rx, ry, 0] in base axes.
@@ -120,8 +113,8 @@ class BaseTilt(BodyEffect):
 
     name = "base_tilt"
     title = "base tilt"
-    scope = BASE
-    parameters = (Parameter("rx", "rad"), Parameter("ry", "rad"))
+    scope = base.BASE
+    parameters = (base.Parameter("rx", "rad"), base.Parameter("ry", "rad"))
     prior_std = (0.03, 0.03)
     phrase = Phrase(
         "the base is tilted by {length}",
@@ -129,16 +122,18 @@ class BaseTilt(BodyEffect):
     )
     shows = ((LOADS, "grows with the load"), (LEVELLED, "shows"))
 
-    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
+    def body(
+        self, theta: base.Array, gravity: base.Array, joint: int, values: base.Values
+    ) -> tuple[base.Array, base.Array]:
         """Gravity seen from the tilted base."""
         return theta, np.asarray(self.turn(values).T @ gravity)
 
     @staticmethod
-    def turn(values: Values) -> Array:
+    def turn(values: base.Values) -> base.Array:
         """Orientation (3, 3) of the base against one that stands as the model says."""
         return exp_rotation([float(values["rx"]), float(values["ry"]), 0.0])
 
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
         """A base that stands on an upright link."""
         if more.floating:
             return NO_PLACE
@@ -150,7 +145,7 @@ class BaseTilt(BodyEffect):
 KEYS = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
-class ExternalWrench(TorqueEffect):
+class ExternalWrench(base.TorqueEffect):
     """A constant wrench w that pushes the flange for a time: tau_measured = tau_rigid - J^T w.
 
     At the origin of the last link, base axes.
@@ -158,11 +153,8 @@ class ExternalWrench(TorqueEffect):
 
     name = "external_wrench"
     title = "external wrench"
-    scope = FLANGE
-    parameters = (
-        *(Parameter(key, "N") for key in KEYS[:3]),
-        *(Parameter(key, "N m") for key in KEYS[3:]),
-    )
+    scope = base.FLANGE
+    parameters = tuple(base.Parameter(key, "N" if key in KEYS[:3] else "N m") for key in KEYS)
     prior_std = (15.0, 15.0, 15.0, 2.0, 2.0, 2.0)
     inexact = 0.05
     phrase = Phrase(
@@ -174,12 +166,14 @@ class ExternalWrench(TorqueEffect):
     passing = True
     watched = True
 
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def torque(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """-J^T w."""
         wrench = np.array([values[key] for key in KEYS], dtype=float)
         return -motion.arm.wrench_torque(motion.q, wrench)
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
         """The wrench."""
         sums.wrench += np.array([values[key] for key in KEYS], dtype=float)
         return True

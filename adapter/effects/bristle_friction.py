@@ -4,35 +4,23 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
-from adapter.effects.base import (
-    LEVEL,
-    TWO_LEVELS,
-    Array,
-    JointSignals,
-    JointTorque,
-    LearnedEffect,
-    Motion,
-    Parameter,
-    Template,
-    Values,
-    late_jit,
-    on_joint,
-)
+from adapter.effects import base
 from adapter.effects.by_joint import WAYS_RAD, shares_of_ways
 from adapter.effects.phrases import SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import FRICTION, Additions
 
 USUAL_RAD, TIMES = 1.5e-3, 3.0  # and by what factor it is off: a real Panda, a KUKA LWR4
-WAY = Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
+WAY = base.Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
+MAYBE_WAY = replace(WAY, optional=True)
 VELOCITIES = (0.03, 0.06, 0.12, 0.25)  # rad/s, tried for vs
-SCALE = Parameter("vs", "rad/s", lower=1e-3, upper=10.0, grid_share=0.03)
+SCALE = base.Parameter("vs", "rad/s", lower=1e-3, upper=10.0, grid_share=0.03)
 
 
-@late_jit
+@base.late_jit
 def bend(steps, s0, z, bent):
     """Fill bent (m, n): how far the bristles of n joints are bent after each step of way.
 
@@ -50,7 +38,7 @@ def bend(steps, s0, z, bent):
             bent[i, j] = z[j]
 
 
-def bending(q: Array, s0: float) -> Array:
+def bending(q: base.Array, s0: float) -> base.Array:
     """z (m,) of bristles along the way of a joint q (m,), rad, that starts at zero."""
     steps = np.diff(q, prepend=q[:1])
     z = np.empty((len(q), 1))
@@ -58,26 +46,32 @@ def bending(q: Array, s0: float) -> Array:
     return z[:, 0]
 
 
-class Rubs(JointTorque):
+class Rubs(base.JointTorque):
     """Friction that may wind up over a small way s0 before the joint slides."""
 
     @abstractmethod
-    def level(self, dq: Array, values: Values) -> Array:
+    def level(self, dq: base.Array, values: base.Values) -> base.Array:
         """N m of a joint that slides at dq, rad/s."""
 
-    def bristles(self, values: Values) -> float | None:
+    def bristles(self, values: base.Values) -> float | None:
         """s0, where it has one."""
         return float(values["s0"]) if "s0" in values else None
 
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
+        """The level in motion, as dry friction."""
+        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
+
+    def torque(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """The level times z, which is zero before the motion; of rows apart as if each slid."""
         dq, s0 = motion.dq[:, joint], self.bristles(values)
         at_once = motion.apart or s0 is None
         z = motion.direction[:, joint] if at_once else bending(motion.q[:, joint], cast(float, s0))
-        return on_joint(motion, joint, self.level(dq, values) * z)
+        return base.on_joint(motion, joint, self.level(dq, values) * z)
 
 
-class BristleFriction(LearnedEffect, Rubs):
+class BristleFriction(base.LearnedEffect, Rubs):
     """Coulomb friction that winds up over a small way before the joint slides (Dahl).
 
     tau = Fc z, dz/dt = (dq - |dq| z) / s0. Positive Fc opposes motion. What rubs does not slide at
@@ -88,35 +82,35 @@ class BristleFriction(LearnedEffect, Rubs):
 
     name = "bristle_friction"
     title = "bristle friction"
-    parameters = (Parameter("Fc", "N m"), WAY)
+    parameters = (base.Parameter("Fc", "N m"), WAY)
     prior_std = 1.0  # of Fc, as of Coulomb friction
     shape_key, shapes = "s0", WAYS_RAD
     positive = ("Fc",)
     inexact = 0.02
     band = 0.3  # static friction is 1 to 1.6 times Coulomb's in what is published
-    form = LEVEL
+    form = base.LEVEL
     bundled = True
-    simpler = ((LEVEL, 0.01),)  # Coulomb friction, which is the same where s0 is small
+    simpler = ((base.LEVEL, 0.01),)  # Coulomb friction, which is the same where s0 is small
     phrase = Phrase("{who} {lacks} {Fc} of bristle friction, which winds up over {s0}", "Fc")
     shows = ((STILL, "fades or changes sign"), (TURNS, "turns over gradually"))
 
-    def templates(self) -> tuple[Template, ...]:
+    def templates(self) -> tuple[base.Template, ...]:
         """The level, at several ways; at once it is Coulomb friction."""
         return tuple(map(_template, WAYS_RAD[1:]))
 
-    def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:
+    def reshaped(self, values: base.Values, ratio: float) -> tuple[base.Template, ...]:
         """Another s0."""
         return (_template(WAY.nearest(ratio * float(values["s0"]))),)
 
-    def log_odds_of(self, values: Values) -> float:
+    def log_odds_of(self, values: base.Values) -> float:
         """Friction that slides at once looks like bristles over a way that no joint has."""
         return log_odds_of_way(float(values["s0"]))
 
-    def level(self, dq: Array, values: Values) -> Array:
+    def level(self, dq: base.Array, values: base.Values) -> base.Array:
         """Fc."""
         return np.full_like(dq, values["Fc"])
 
-    def law(self, at: JointSignals, values: Values) -> Array:
+    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """Fc z."""
         return np.asarray(values["Fc"] * self.torque_per_unit(at, values["s0"]))
 
@@ -126,17 +120,13 @@ class BristleFriction(LearnedEffect, Rubs):
             return "coulomb_friction", {"Fc": value}
         return super().learned_as(value, shape)
 
-    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+    def basis(self, at: base.JointSignals) -> tuple[base.Array, ...]:
         """z of each of the ways."""
         return tuple(at.bent)
 
-    def shares(self, shape: Array) -> Array:
+    def shares(self, shape: base.Array) -> base.Array:
         """Those of the ways around s0."""
         return shares_of_ways(shape)
-
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """The level, as dry friction."""
-        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
 
 def log_odds_of_way(s0: float) -> float:
@@ -144,11 +134,8 @@ def log_odds_of_way(s0: float) -> float:
     return float(-0.5 * (np.log(s0 / USUAL_RAD) / np.log(TIMES)) ** 2)
 
 
-def _template(s0: float) -> Template:
-    def decode(x: Array) -> dict[str, Any]:
-        return {"Fc": float(x[0]), "s0": s0}
-
-    return Template((1.0,), decode, f"s0 = {s0:.3g} rad")
+def _template(s0: float) -> base.Template:
+    return base.Template((1.0,), lambda x: {"Fc": float(x[0]), "s0": s0}, f"s0 = {s0:.3g} rad")
 
 
 class StribeckFriction(Rubs):
@@ -161,44 +148,39 @@ class StribeckFriction(Rubs):
 
     name = "stribeck_friction"
     title = "Stribeck friction"
-    parameters = (
-        Parameter("Fc", "N m"),
-        Parameter("Fs", "N m"),
-        SCALE,
-        replace(WAY, optional=True),
-    )
+    parameters = (base.Parameter("Fc", "N m"), base.Parameter("Fs", "N m"), SCALE, MAYBE_WAY)
     positive = ("Fc", "Fs")
     log_odds = -3.0
     inexact = 0.03
-    simpler = ((LEVEL, 0.01), (TWO_LEVELS, 0.01))
+    simpler = ((base.LEVEL, 0.01), (base.TWO_LEVELS, 0.01))
     phrase = Phrase("{who} {lacks} Stribeck friction of {Fs} at rest and {Fc} in motion")
     shows = ((SPEEDS, "falls as the joint gets faster"), (STILL, "fades or changes sign"))
 
-    def templates(self) -> tuple[Template, ...]:
+    def templates(self) -> tuple[base.Template, ...]:
         """Both levels at several velocity scales, without bristles and with."""
         return tuple(_falling(vs, s0) for s0 in (None, USUAL_RAD) for vs in VELOCITIES)
 
-    def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:
+    def reshaped(self, values: base.Values, ratio: float) -> tuple[base.Template, ...]:
         """Another vs, another s0."""
         vs, s0 = float(values["vs"]), self.bristles(values)
         other = _falling(SCALE.nearest(ratio * vs), s0)
         return (other,) if s0 is None else (other, _falling(vs, WAY.nearest(ratio * s0)))
 
-    def log_odds_of(self, values: Values) -> float:
+    def log_odds_of(self, values: base.Values) -> float:
         """As of bristles."""
         s0 = self.bristles(values)
         return 0.0 if s0 is None else log_odds_of_way(s0)
 
-    def possible(self, values: Values) -> bool:
+    def possible(self, values: base.Values) -> bool:
         """Friction that falls with speed, all of it positive."""
         return 0.0 < float(values["Fc"]) < float(values["Fs"])
 
-    def level(self, dq: Array, values: Values) -> Array:
+    def level(self, dq: base.Array, values: base.Values) -> base.Array:
         """The Stribeck curve."""
         level, rest, vs = (values[key] for key in ("Fc", "Fs", "vs"))
         return np.asarray(level + (rest - level) * np.exp(-((dq / vs) ** 2)))
 
-    def law(self, at: JointSignals, values: Values) -> Array:
+    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """The curve times z, where there is a way over which bristles are known to be bent."""
         z, s0 = at.direction, values.get("s0", WAY.lower)
         if np.max(s0) > WAYS_RAD[0]:
@@ -206,16 +188,10 @@ class StribeckFriction(Rubs):
             z = np.where(s0 > WAYS_RAD[0], bent, z)
         return np.asarray(self.level(at.dq, values) * z)
 
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """What stays in motion, as dry friction."""
-        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
-
-def _falling(vs: float, s0: float | None = None) -> Template:
+def _falling(vs: float, s0: float | None = None) -> base.Template:
     fixed = {"vs": vs} if s0 is None else {"vs": vs, "s0": s0}
-
-    def decode(x: Array) -> dict[str, Any]:
-        return {"Fc": float(x[0]), "Fs": float(x[1]), **fixed}
-
-    said = "" if s0 is None else f", s0 = {s0:.3g} rad"
-    return Template((1.0, 1.0), decode, f"vs = {vs:.3g} rad/s{said}")
+    said = f"vs = {vs:.3g} rad/s" + ("" if s0 is None else f", s0 = {s0:.3g} rad")
+    return base.Template(
+        (1.0, 1.0), lambda x: {"Fc": float(x[0]), "Fs": float(x[1]), **fixed}, said
+    )

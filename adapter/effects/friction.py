@@ -6,30 +6,17 @@ from copy import copy
 
 import numpy as np
 
-from adapter.effects.base import (
-    LEVEL,
-    LEVEL_BY_LOAD,
-    TWO_LEVELS,
-    Array,
-    JointSignals,
-    JointTorque,
-    LinearEffect,
-    Motion,
-    Parameter,
-    TorqueEffect,
-    Values,
-    on_joint,
-)
+from adapter.effects import base
 from adapter.effects.phrases import BOTH_WAYS, LATER, LOADS, SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import DAMPING, FRICTION, Additions
 
 
-class ViscousFriction(LinearEffect):
+class ViscousFriction(base.LinearEffect):
     """tau = Fv dq: friction torque in proportion to the joint's speed."""
 
     name = "viscous_friction"
     title = "viscous friction"
-    parameters = (Parameter("Fv", "N m s/rad"),)
+    parameters = (base.Parameter("Fv", "N m s/rad"),)
     prior_std = 1.0  # published Panda values are 0.03 to 0.09 (Knezevic)
     place = DAMPING
     positive = ("Fv",)
@@ -40,66 +27,66 @@ class ViscousFriction(LinearEffect):
     watched = True
     bundled = True
 
-    def column(self, at: JointSignals) -> Array:
+    def column(self, at: base.JointSignals) -> base.Array:
         """dq."""
         return at.dq
 
 
-class CoulombFriction(LinearEffect):
+class CoulombFriction(base.LinearEffect):
     """tau = Fc sign(dq), smoothed around rest: it depends on the direction of motion alone."""
 
     name = "coulomb_friction"
     title = "Coulomb friction"
-    parameters = (Parameter("Fc", "N m"),)
+    parameters = (base.Parameter("Fc", "N m"),)
     prior_std = 1.0  # published Panda values are 0.2 to 0.5 (Knezevic)
     place = FRICTION
     positive = ("Fc",)
     inexact = 0.02
     band = 0.3  # static friction is 1 to 1.6 times Coulomb's in what is published
     phrase = Phrase.lacks("Fc", "Coulomb friction")
-    form = LEVEL
+    form = base.LEVEL
     shows = ((STILL, "fades or changes sign"), (TURNS, "turns over at once"))
     sudden = True
     watched = True
     bundled = True
 
-    def column(self, at: JointSignals) -> Array:
+    def column(self, at: base.JointSignals) -> base.Array:
         """tanh(dq / w) with w = 0.01 rad/s, or as far as dq goes within the smoothing time."""
         return at.direction
 
 
-class AsymmetricFriction(JointTorque):
+class AsymmetricFriction(base.JointTorque):
     """Coulomb friction of a size for either direction: Fc_pos for dq > 0, Fc_neg for dq < 0."""
 
     name = "asymmetric_friction"
     title = "asymmetric friction"
-    parameters = (Parameter("Fc_pos", "N m"), Parameter("Fc_neg", "N m"))
+    parameters = (base.Parameter("Fc_pos", "N m"), base.Parameter("Fc_neg", "N m"))
     prior_std = (1.0, 1.0)
     positive = ("Fc_pos", "Fc_neg")
     log_odds = -3.0  # Coulomb friction and an offset say the same in simpler words
     inexact = 0.02
-    simpler = ((LEVEL, 10.0), (LEVEL_BY_LOAD, 10.0))
+    simpler = ((base.LEVEL, 10.0), (base.LEVEL_BY_LOAD, 10.0))
     phrase = Phrase("{who} {lacks} Coulomb friction of {Fc_pos} forwards and {Fc_neg} backwards")
-    form = TWO_LEVELS
+    form = base.TWO_LEVELS
     shows = ((STILL, "fades or changes sign"), (BOTH_WAYS, "is larger one way than the other"))
 
-    def law(self, at: JointSignals, values: Values) -> Array:
+    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """Fc_pos where dq > 0, -Fc_neg where dq < 0, smoothed around rest."""
         sign = at.direction
         return np.asarray(np.where(sign > 0.0, values["Fc_pos"], values["Fc_neg"]) * sign)
 
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
         """The mean, as dry friction."""
         mean = 0.5 * (values["Fc_pos"] + values["Fc_neg"])
         return more.at_joint(FRICTION, joint, mean, "the mean of both is there as friction")
 
 
-class LoadDependentFriction(LinearEffect):
+class LoadDependentFriction(base.LinearEffect):
     """Fl |tau| sign(dq): friction in proportion to the rigid torque tau that the gear carries."""
 
     name = "load_dependent_friction"
     title = "load-dependent friction"
-    parameters = (Parameter("Fl", "1"),)
+    parameters = (base.Parameter("Fl", "1"),)
     prior_std = 0.05
     positive = ("Fl",)
     log_odds = -1.0
@@ -109,11 +96,11 @@ class LoadDependentFriction(LinearEffect):
         "Fl",
         "{who} {has} less friction than the model says, by {x} of its load",
     )
-    form = LEVEL_BY_LOAD
+    form = base.LEVEL_BY_LOAD
     by_load = True
     shows = ((LOADS, "grows with the load"), (STILL, "fades or changes sign"))
 
-    def column(self, at: JointSignals) -> Array:
+    def column(self, at: base.JointSignals) -> base.Array:
         """|tau| sign(dq)."""
         return np.asarray(np.abs(at.tau) * at.direction)
 
@@ -122,12 +109,12 @@ SLOWEST = 0.008  # N m/s
 LONG_S, RISE_NM = 60.0, 0.16  # in a longer recording: what it rises by in all, as within 20 s
 
 
-class FrictionDrift(TorqueEffect):
+class FrictionDrift(base.TorqueEffect):
     """A gear that warms up: Coulomb friction changes by dFc each second, from the start on."""
 
     name = "friction_drift"
     title = "friction drift"
-    parameters = (Parameter("dFc", "N m/s"),)
+    parameters = (base.Parameter("dFc", "N m/s"),)
     prior_std = 0.05
     log_odds = -5.0
     inexact = 0.03
@@ -146,11 +133,13 @@ class FrictionDrift(TorqueEffect):
         slower.slowest = RISE_NM / seconds
         return slower
 
-    def possible(self, values: Values) -> bool:
+    def possible(self, values: base.Values) -> bool:
         """What drifts more slowly is not told from a velocity signal that is not quite right."""
         return abs(float(values["dFc"])) > self.slowest
 
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def torque(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """dFc t sign(dq), t since the effect began, or the recording."""
         column = motion.t * motion.direction[:, joint]
-        return on_joint(motion, joint, float(values["dFc"]) * column)
+        return base.on_joint(motion, joint, float(values["dFc"]) * column)

@@ -15,18 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import (
-    Array,
-    JointSignals,
-    JointTorque,
-    LearnedEffect,
-    Motion,
-    Parameter,
-    Template,
-    Values,
-    on_joint,
-    polar,
-)
+from adapter.effects import base as base
 from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
 
 LAW = "law: "  # begins the name of a law that has no other
@@ -97,7 +86,7 @@ class Expression:
 
     text: str
     powers: Mapping[str, int]
-    term: Callable[[JointSignals, Array], Array]
+    term: Callable[[base.JointSignals, base.Array], base.Array]
     setting: Setting | None = None
     drags: bool = False
 
@@ -110,19 +99,19 @@ class Expression:
         return _unit(total)
 
 
-def _above(at: JointSignals, a: Array) -> Array:
+def _above(at: base.JointSignals, a: base.Array) -> base.Array:
     return np.maximum(at.q - a, 0.0)
 
 
-def _below(at: JointSignals, a: Array) -> Array:
+def _below(at: base.JointSignals, a: base.Array) -> base.Array:
     return np.maximum(a - at.q, 0.0)
 
 
-def _deadband(at: JointSignals, a: Array) -> Array:
+def _deadband(at: base.JointSignals, a: base.Array) -> base.Array:
     return np.asarray(np.sign(at.tau) * np.maximum(np.abs(at.tau) - a, 0.0))
 
 
-def _power(at: JointSignals, p: Array) -> Array:
+def _power(at: base.JointSignals, p: base.Array) -> base.Array:
     return np.asarray(np.sign(at.dq) * np.abs(at.dq) ** p)
 
 
@@ -153,15 +142,12 @@ def _grammar() -> tuple[Expression, ...]:
         Expression("tauⱼ", {"tau": 1}, lambda at, _: at.tau),
         Expression("tauⱼ |tauⱼ|", {"tau": 2}, lambda at, _: at.tau * np.abs(at.tau)),
     ]
-    return (
-        *out,
-        *_over_angle("sign(dq)", {}, lambda at: at.direction),
-        *_over_angle("dq", {"dq": 1}, lambda at: at.dq),
-    )
+    out += _over_angle("sign(dq)", {}, lambda at: at.direction)
+    return (*out, *_over_angle("dq", {"dq": 1}, lambda at: at.dq))
 
 
 def _over_angle(
-    text: str, powers: Mapping[str, int], friction: Callable[[JointSignals], Array]
+    text: str, powers: Mapping[str, int], friction: Callable[[base.JointSignals], base.Array]
 ) -> tuple[Expression, ...]:
     """Friction that depends on the angle."""
     once, twice = {**powers, "q": 1}, {**powers, "q": 2}
@@ -174,7 +160,7 @@ def _over_angle(
     )
 
 
-class OverSignals(JointTorque):
+class OverSignals(base.JointTorque):
     """A torque of no catalogue, by signals of one joint.
 
     Attributes:
@@ -189,13 +175,13 @@ class OverSignals(JointTorque):
         """The signal over which it is a curve; of what is a kind of friction, not its speed."""
         return next(iter(self.variables - {"dq"}), "dq")
 
-    def curve(self, x: Array, values: Values) -> Array:
+    def curve(self, x: base.Array, values: base.Values) -> base.Array:
         """Torque (k,) over that signal; of what is a kind of friction, at 1 rad/s."""
         q, dq, ddq, tau = (x if key == self.along else np.ones_like(x) for key in SIGNALS)
-        return self.on_signals(JointSignals(q, dq, ddq, tau), values)
+        return self.on_signals(base.JointSignals(q, dq, ddq, tau), values)
 
     @abstractmethod
-    def on_signals(self, at: JointSignals, values: Values) -> Array:
+    def on_signals(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """Torque by signals of the joint that it follows."""
 
 
@@ -221,33 +207,33 @@ class Law(OverSignals):
         self.positive = ("c",) if expression.drags else ()  # type: ignore[misc]
         self.turns = bool(setting and setting.wave)  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
-        own = [Parameter("c", expression.unit)]
-        own += [Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []
-        own += [Parameter("phase", "rad")] if setting and setting.wave else []
+        own = [base.Parameter("c", expression.unit)]
+        own += [base.Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []
+        own += [base.Parameter("phase", "rad")] if setting and setting.wave else []
         self.parameters = tuple(own)  # type: ignore[misc]
         sizes_said = ", ".join(f"{p.key} = {{{p.key}}}" for p in own)
         self.phrase = Phrase(f"{{who}} {{has}} a {{title}}: {sizes_said}", "c")  # type: ignore[misc]
 
-    def templates(self) -> tuple[Template, ...]:
+    def templates(self) -> tuple[base.Template, ...]:
         """Its coefficient, or two of a wave, at the first setting that is tried."""
         setting = self.expression.setting
         return (self.at(setting.tried[0] if setting else 1.0),)
 
-    def at(self, value: float) -> Template:
+    def at(self, value: float) -> base.Template:
         """Its coefficients, of unit prior, where its setting is fixed."""
         setting = self.expression.setting
         fixed = {setting.key: value} if setting else {}
         label = f"{setting.key} = {value:.4g}" if setting else ""
         if not (setting and setting.wave):
-            return Template((1.0,), lambda x: {"c": float(x[0]), **fixed}, label)
+            return base.Template((1.0,), lambda x: {"c": float(x[0]), **fixed}, label)
 
-        def decode(x: Array) -> dict[str, Any]:
-            size, phase = polar(x)
+        def decode(x: base.Array) -> dict[str, Any]:
+            size, phase = base.polar(x)
             return {"c": size, **fixed, "phase": phase}
 
-        return Template((1.0, 1.0), decode, label)
+        return base.Template((1.0, 1.0), decode, label)
 
-    def around(self, values: Values, std: float) -> Template | None:
+    def around(self, values: base.Values, std: float) -> base.Template | None:
         """Its coefficient, and by how much its setting is not as in `values`; None without one.
 
         `std`: of the coefficient.
@@ -255,14 +241,14 @@ class Law(OverSignals):
         setting = self.expression.setting
         if setting is None or setting.wave:
             return None
-        key, middle = setting.key, float(values[setting.key])
+        key, middle, lower = setting.key, float(values[setting.key]), setting.lower
+        return base.Template(
+            (std, setting.size),
+            lambda x: {"c": float(x[0]), key: max(middle + float(x[1]), lower)},
+            linear=False,
+        )
 
-        def decode(x: Array) -> dict[str, Any]:
-            return {"c": float(x[0]), key: max(middle + float(x[1]), setting.lower)}
-
-        return Template((std, setting.size), decode, linear=False)
-
-    def law(self, at: JointSignals, values: Values) -> Array:
+    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """c times the expression of signals (..., n) of all joints, or of one that has its own."""
         if self.by:
             k = slice(self.by - 1, self.by)
@@ -270,17 +256,21 @@ class Law(OverSignals):
             at = at._replace(q=at.q[..., k], dq=at.dq[..., k], ddq=at.ddq[..., k], tau=tau)
         return self.on_signals(at, values)
 
-    def on(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def on(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """Torque (m,) of one joint, by its own signals or another's."""
         k = self.by - 1 if self.by else joint
-        at = JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
+        at = base.JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
         return self.on_signals(at, values)
 
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def torque(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """The law on one joint."""
-        return on_joint(motion, joint, self.on(motion, tau, joint, values))
+        return base.on_joint(motion, joint, self.on(motion, tau, joint, values))
 
-    def on_signals(self, at: JointSignals, values: Values) -> Array:
+    def on_signals(self, at: base.JointSignals, values: base.Values) -> base.Array:
         setting = self.expression.setting
         term = self.expression.term(at, np.asarray(values[setting.key] if setting else 0.0))
         if setting and setting.wave:
@@ -288,12 +278,12 @@ class Law(OverSignals):
         return np.asarray(values["c"] * term)
 
 
-class LearnedLaw(LearnedEffect, Law):
+class LearnedLaw(base.LearnedEffect, Law):
     """A law without a setting, by the joint's own motion: it can be learned on beside θ."""
 
     prior_std, step = 10.0, 1.0  # of powers of some tenths of a rad/s
 
-    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+    def basis(self, at: base.JointSignals) -> tuple[base.Array, ...]:
         """The expression."""
         return (np.asarray(self.expression.term(at, np.zeros(1))),)
 
@@ -306,14 +296,16 @@ def _laws_of(expression: Expression) -> list[Law]:
 
 
 PIECES, DEGREE = 5, 3  # of a spline over a signal's range
-WEIGHTS: dict[str, Callable[[JointSignals], Array | float]] = {
+WEIGHTS: dict[str, Callable[[base.JointSignals], base.Array | float]] = {
     "": lambda at: 1.0,
     "sign(dq) ": lambda at: at.direction,
     "dq ": lambda at: at.dq,
 }
 
 
-def splines(x: Array, low: Array | float, high: Array | float, pieces: int = PIECES) -> Array:
+def splines(
+    x: base.Array, low: base.Array | float, high: base.Array | float, pieces: int = PIECES
+) -> base.Array:
     """Cubic B-splines (pieces + DEGREE, ...) over a range; beyond it they stay as at its end."""
     step = np.maximum(np.subtract(high, low), 1e-9) / pieces
     at = np.clip((x - low) / step, 0.0, pieces) + DEGREE
@@ -342,29 +334,28 @@ class Curve(OverSignals):
         self.by_load = signal == "tau"  # type: ignore[misc]
         unit = _unit(SIGNALS[signal])
         self.parameters = (  # type: ignore[misc]
-            Parameter("x", "N m", count=PIECES + DEGREE),
-            Parameter("low", unit),
-            Parameter("high", unit),
+            base.Parameter("x", "N m", count=PIECES + DEGREE),
+            base.Parameter("low", unit),
+            base.Parameter("high", unit),
         )
         self.phrase = Phrase("{who} {has} {torque} that follow " + text + " by no formula")  # type: ignore[misc]
 
-    def between(self, low: float, high: float) -> Template:
+    def between(self, low: float, high: float) -> base.Template:
         """All its coefficients over a range."""
+        return base.Template(
+            (CURVE_NM,) * (PIECES + DEGREE),
+            lambda x: {"x": [float(value) for value in x], "low": low, "high": high},
+        )
 
-        def decode(x: Array) -> dict[str, Any]:
-            return {"x": [float(value) for value in x], "low": low, "high": high}
-
-        return Template((CURVE_NM,) * (PIECES + DEGREE), decode)
-
-    def templates(self) -> tuple[Template, ...]:
+    def templates(self) -> tuple[base.Template, ...]:
         """Over a usual range."""
         return (self.between(-1.0, 1.0),)
 
-    def law(self, at: JointSignals, values: Values) -> Array:
+    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """By each joint's own signals."""
         return self.on_signals(at, values)
 
-    def on_signals(self, at: JointSignals, values: Values) -> Array:
+    def on_signals(self, at: base.JointSignals, values: base.Values) -> base.Array:
         """Splines times coefficients, (..., n) of all joints or of one."""
         basis = splines(getattr(at, self.signal), values["low"], values["high"])
         x = np.moveaxis(np.asarray(values["x"], dtype=float), -1, 0)
@@ -372,9 +363,7 @@ class Curve(OverSignals):
         return np.asarray(WEIGHTS[self.weight](at) * np.sum(basis * x, axis=0))
 
 
-CURVES: dict[str, Curve] = {
-    curve.name: curve
-    for curve in (*map(Curve, SIGNALS), Curve("q", "sign(dq) "), Curve("q", "dq "))
-}
+OVER_Q = Curve("q", "sign(dq) "), Curve("q", "dq ")
+CURVES: dict[str, Curve] = {curve.name: curve for curve in (*map(Curve, SIGNALS), *OVER_Q)}
 LAWS: dict[str, Law] = {law.name: law for x in _grammar() for law in _laws_of(x)}
 EXPRESSIONS = tuple(dict.fromkeys(law.expression.text for law in LAWS.values()))

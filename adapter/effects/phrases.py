@@ -10,7 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from adapter.effects.base import Effect
 
 
 @dataclass(frozen=True)
@@ -122,43 +125,21 @@ SWINGS = DecidingExperiment(
 )
 
 
-class Shown(Protocol):
-    """What is asked of an effect here."""
-
-    title: ClassVar[str]
-    shows: ClassVar[tuple[tuple[DecidingExperiment, str], ...]]
+# As they stand above, in the order of preference: what is easy to do and sure comes first.
+SPLITS = tuple(x for x in globals().values() if isinstance(x, DecidingExperiment))
 
 
-# In the order of preference: what is easy to do and sure comes first.
-SPLITS = (
-    ALONE,
-    BARE,
-    FLANK,
-    LOADS,
-    WEIGHED,
-    SPEEDS,
-    STILL,
-    BOTH_WAYS,
-    LATER,
-    TURN,
-    LEVELLED,
-    KNOWN_WEIGHT,
-    TURNS,
-    SWINGS,
-)
-
-
-def shown(effect: Shown, split: DecidingExperiment) -> str:
+def shown(effect: Effect, split: DecidingExperiment) -> str:
     """What an effect shows in an experiment."""
     return dict(effect.shows).get(split, split.untouched)
 
 
-def experiments(effect: Shown, rivals: Iterable[Shown]) -> tuple[str, ...]:
+def experiments(effect: Effect, rivals: Iterable[Effect]) -> tuple[str, ...]:
     """How to tell an effect from its rivals: a sentence for each experiment, the easiest first.
 
     A rival that no experiment tells from it is not in any.
     """
-    by_split: dict[DecidingExperiment, list[Shown]] = {}
+    by_split: dict[DecidingExperiment, list[Effect]] = {}
     for rival in rivals:
         split = next((s for s in SPLITS if shown(effect, s) != shown(rival, s)), None)
         if split is not None:

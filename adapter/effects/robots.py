@@ -51,11 +51,8 @@ def _effects(joints: Sequence[dict[str, float]]) -> tuple[dict[str, Any], ...]:
         key = MJCF_PLACES.get(effect.place, "")
         having = [j for j, joint in enumerate(joints) if key in joint]
         if having:
-            keys = (key, "springref")[: len(effect.parameters)]
-            values = {
-                parameter.key: [joints[j].get(k, 0.0) for j in having]
-                for parameter, k in zip(effect.parameters, keys, strict=True)
-            }
+            pairs = zip(effect.parameters, (key, "springref"), strict=False)
+            values = {p.key: [joints[j].get(k, 0.0) for j in having] for p, k in pairs}
             numbers = [j + 1 for j in having]
             found.append({"effect": effect.name, "joints": numbers, "parameters": values})
     return tuple(found)

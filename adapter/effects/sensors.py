@@ -6,18 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import (
-    ALL,
-    LATE,
-    Array,
-    LearnedEffect,
-    LinearEffect,
-    Motion,
-    Parameter,
-    SensorEffect,
-    Template,
-    Values,
-)
+from adapter.effects import base as base
 from adapter.effects.by_joint import ByJoint, JointSignals
 from adapter.effects.phrases import KNOWN_WEIGHT, LOADS, SPEEDS, STILL, SWINGS, Phrase
 
@@ -30,12 +19,12 @@ SLOW_S = 0.02  # of sensors whose low-pass is there to be seen: 5 to 20 Hz
 LEAST_C_S2 = 5e-5  # that noise of the motion does not look like
 
 
-class TorqueOffset(LinearEffect):
+class TorqueOffset(base.LinearEffect):
     """A constant that the joint's torque sensor adds: tau_measured = tau + o."""
 
     name = "torque_offset"
     title = "torque sensor offset"
-    parameters = (Parameter("o", "N m"),)
+    parameters = (base.Parameter("o", "N m"),)
     prior_std = 1.0
     phrase = Phrase.reads("o", "torque sensor")
     after_sensors = True  # whatever else the sensors do
@@ -43,12 +32,12 @@ class TorqueOffset(LinearEffect):
     watched = True
     bundled = True
 
-    def column(self, at: JointSignals) -> Array:
+    def column(self, at: JointSignals) -> base.Array:
         """One."""
         return np.ones_like(at.dq)
 
 
-class TorqueGain(SensorEffect):
+class TorqueGain(base.SensorEffect):
     """A torque sensor that reads too much or too little in proportion.
 
     measured = (1 + g) tau; g = 0.05 is 5 %.
@@ -56,29 +45,38 @@ class TorqueGain(SensorEffect):
 
     name = "torque_gain"
     title = "torque sensor gain"
-    parameters = (Parameter("g", "1", lower=-0.95),)
+    parameters = (base.Parameter("g", "1", lower=-0.95),)
     prior_std = 0.05
     phrase = Phrase.reads("g", "torque sensor")
     shows = ((LOADS, "grows with the load"), (KNOWN_WEIGHT, "misreads it in proportion"))
     watched = True
 
-    def columns(self, at: JointSignals) -> tuple[Array, ...]:
+    def columns(self, at: JointSignals) -> tuple[base.Array, ...]:
         """The torque itself."""
         return (at.tau,)
 
-    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def measured(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """(1 + g) tau on the joint."""
         out = tau.copy()
         out[:, joint] *= 1.0 + float(values["g"])
         return out
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
         """The gain."""
         sums.log_gain[joint] += np.log1p(float(values["g"]))
         return True
 
 
-class SignalDelay(SensorEffect):
+LATENESS = (
+    (LOADS, "grows with the load"),
+    (SPEEDS, "rises in proportion to the speed"),
+    (STILL, "is gone"),
+)
+
+
+class SignalDelay(base.SensorEffect):
     """Torque signals that arrive later than positions; of all joints or of one.
 
     tau_measured(t) = tau(t - d).
@@ -86,27 +84,25 @@ class SignalDelay(SensorEffect):
 
     name = "signal_delay"
     title = "signal delay"
-    scope = ALL
-    parameters = (Parameter("d", "s", lower=-0.1, upper=0.1),)
+    scope = base.ALL
+    parameters = (base.Parameter("d", "s", lower=-0.1, upper=0.1),)
     prior_std = 3e-3
     inexact = 0.02
-    form = LATE
+    form = base.LATE
     phrase = Phrase(
         "the torque of {who} comes {x} after the position",
         "d",
         "the torque of {who} comes {x} before the position",
     )
-    shows = (
-        (LOADS, "grows with the load"),
-        (SPEEDS, "rises in proportion to the speed"),
-        (STILL, "is gone"),
-    )
+    shows = LATENESS
 
-    def possible(self, values: Values) -> bool:
+    def possible(self, values: base.Values) -> bool:
         """Late, by a dozen milliseconds at most; what asks for more is something else."""
         return 0.0 < float(values["d"]) < LATEST_S
 
-    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def measured(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """tau(t - d): whole samples later, and by its rate what is less."""
         d = float(values["d"])
         step = 0.0 if motion.apart else float(np.median(np.diff(motion.t)))
@@ -121,13 +117,13 @@ class SignalDelay(SensorEffect):
         out[:, joint] = late[:, joint]
         return np.asarray(out)
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
         """The delay."""
         sums.delay_s[joint] += float(values["d"])
         return True
 
 
-class TorqueFilter(LearnedEffect, SensorEffect):
+class TorqueFilter(base.LearnedEffect, base.SensorEffect):
     """A torque sensor that passes only what is slow; all joints' alike, or one's.
 
     (d² - c) measured'' + d measured' + measured = tau. Its series begins with
@@ -138,48 +134,45 @@ class TorqueFilter(LearnedEffect, SensorEffect):
 
     name = "torque_filter"
     title = "torque sensor low-pass"
-    scope = ALL
-    parameters = (Parameter("d", "s", lower=-0.1, upper=0.1), Parameter("c", "s2"))
+    scope = base.ALL
+    parameters = (base.Parameter("d", "s", lower=-0.1, upper=0.1), base.Parameter("c", "s2"))
     prior_std = (3e-3, 1e-4)
     rate = 1
     learned, step = 1, 1e-4  # c; how late a torque is, is for `gap` to say
     positive = ("c",)
     log_odds = -8.0
     inexact = 0.02
-    simpler = ((LATE, 0.03),)
-    form = LATE
+    simpler = ((base.LATE, 0.03),)
+    form = base.LATE
     phrase = Phrase("the torque sensor of {who} is a low-pass, with d = {d} and c = {c}")
-    shows = (
-        (LOADS, "grows with the load"),
-        (SPEEDS, "rises in proportion to the speed"),
-        (STILL, "is gone"),
-        (SWINGS, "makes the torque smaller"),
-    )
+    shows = (*LATENESS, (SWINGS, "makes the torque smaller"))
 
-    def templates(self) -> tuple[Template, ...]:
+    def templates(self) -> tuple[base.Template, ...]:
         """Of a motor's or a sensor's electronics; and a slow one of one time constant."""
 
-        def of_first_order(x: Array) -> dict[str, Any]:
+        def of_first_order(x: base.Array) -> dict[str, Any]:
             return {"d": float(x[0]), "c": float(x[0]) ** 2}
 
-        slow = Template((SLOW_S,), of_first_order, "of first order", chord=True)
+        slow = base.Template((SLOW_S,), of_first_order, "of first order", chord=True)
         return (*super().templates(), slow)
 
-    def possible(self, values: Values) -> bool:
+    def possible(self, values: base.Values) -> bool:
         """Smoother, and not much earlier."""
         return -MOST_AHEAD_S < float(values["d"]) < MOST_S and super().possible(values)
 
-    def log_odds_of(self, values: Values) -> float:
+    def log_odds_of(self, values: base.Values) -> float:
         """Smoother than any sensor that is no later makes it, noise of the motion looks like it."""
         most = max(float(values["d"]) + MOST_AHEAD_S, 0.0) ** 2 + LEAST_C_S2
         return AFTERWARDS if float(values["c"]) > most else 0.0
 
-    def low_pass(self, values: Values) -> tuple[float, float]:
+    def low_pass(self, values: base.Values) -> tuple[float, float]:
         """The one whose series begins so; where there is none (see `measured`), the nearest."""
         d = max(float(values["d"]), 0.0)
         return d, min(max(d * d - float(values["c"]), 0.0), d * d)
 
-    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+    def measured(
+        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
+    ) -> base.Array:
         """The low-pass of tau, on the joint or all of them; by the series what none of them is.
 
         Fourth derivatives of q are nothing but noise above a band; noise in there would make any
@@ -194,6 +187,6 @@ class TorqueFilter(LearnedEffect, SensorEffect):
             out[:, j] = motion.lagged(own, d, b) + more * bend - early * motion.rate(own)
         return np.asarray(out)
 
-    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+    def basis(self, at: JointSignals) -> tuple[base.Array, ...]:
         """The second rate of the model's torque."""
         return (at.rates[self.rate],)

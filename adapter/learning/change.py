@@ -149,11 +149,8 @@ class ChangeDetector:
         return (s.fast, s.slow), self.samples, self.recent, self.level, most
 
     def _alarming(self, most: float, mean: float) -> bool:
-        s = self.settings
-        return bool(
-            most > max(s.one_factor, s.burst_factor * self._peaks[0])
-            or mean > max(s.all_factor, s.burst_factor * self._peaks[1])
-        )
+        s, (one, every) = self.settings, self.settings.burst_factor * self._peaks
+        return bool(most > max(s.one_factor, one) or mean > max(s.all_factor, every))
 
     def _confirm(self, error: Array, explained: Callable[[], bool]) -> bool:
         """Look on without touching the level; at the end of the wait the alarm must still hold."""

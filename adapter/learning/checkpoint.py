@@ -32,18 +32,8 @@ _STATE = {
     ),
     "schema": (
         *("R0", "p", "start_lam", "kind", "updates", "information", "identifiable", "certain"),
-        *(
-            "_inverse",
-            "_may_move",
-            "_distance",
-            "rank",
-            "ranks",
-            "_calm_ns",
-            "_looked_ns",
-            "converged",
-            "_rough",
-            "_then",
-        ),
+        *("_inverse", "_may_move", "_distance", "rank", "ranks", "_calm_ns", "_looked_ns"),
+        *("converged", "_rough", "_then"),
     ),
     "schema.check": ("misfit", "passed_at", "passed_rank", "turn", "restarts"),
     "schema.moments": MotionMoments._fields,
@@ -108,10 +98,8 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     if int(arrays.get("version", -1)) != VERSION:
         raise SettingsError(f"{path}: not a checkpoint of version {VERSION}")
     if str(arrays.get("about")) != _about(learner):
-        raise SettingsError(
-            f"{path}: is of another robot or other learner settings: {arrays.get('about')}; "
-            f"here: {_about(learner)}"
-        )
+        both = f"{arrays.get('about')}; here: {_about(learner)}"
+        raise SettingsError(f"{path}: is of another robot or other learner settings: {both}")
     lacking = [key for key in (*_NEEDED, *_FINITE) if key not in arrays]
     if lacking:
         raise SettingsError(f"{path}: the checkpoint lacks '{lacking[0]}'")
@@ -143,11 +131,8 @@ def _put(owner: object, name: str, value: np.ndarray | None) -> None:
 
 
 def _about(learner: OnlineLearner) -> str:
-    tree = learner.tree
-    about: dict[str, Any] = {
-        "parent": tree.parent,
-        "settings": dataclasses.asdict(learner.settings),
-    }
+    settings = dataclasses.asdict(learner.settings)
+    about: dict[str, Any] = {"parent": learner.tree.parent, "settings": settings}
     if learner.given:
         about["effects"] = [
             [a.effect.name, a.joint + 1, _plain(a.values), _plain(a.std)] for a in learner.given

@@ -1,5 +1,9 @@
 """One joint frame from its moments in closed form: where λ may start, and where it ends.
 
+The cost of a rotation has saddle points half a turn away from its minimum, and with the position
+beside it other valleys: there ADAM stands still at the wrong frame. The moments tell, since a
+closed form on them needs no start (`SchemaCheck`).
+
 The moments may hold three channels (the online learner's w, v, a) or four (with dw, in batch):
 those that are there are used. Changes of a frame are (turn, shift), turns in the frame's own axes,
 R0 <- R0 exp(turn), p <- p + shift, as `schema_kernels` has them.
@@ -8,6 +12,7 @@ R0 <- R0 exp(turn), p <- p + shift, as `schema_kernels` has them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +32,10 @@ STEPS = 60  # of Gauss-Newton; from Wahba's rotation 4 are enough, from a far st
 SMALLEST_STEP = 1e-13  # rad, m: close to the rounding of a frame
 LONGEST_TURN = 1.0  # rad a step
 SAME_COST = 1e-9  # costs this close, relative to the signals' power, can't be told apart
+# Logarithms of what frames leave unexplained, summed over the channels.
+CLEARLY_BETTER = 0.5
+AGAIN = 2.0  # a joint is checked again when there are so many times the samples
+LOOKS = 20  # until a joint's turn comes again
 
 
 @dataclass
@@ -192,13 +201,6 @@ def curvature_in_parent(sums: Array, weights: Array, frame: Frame) -> tuple[Arra
     return values, vectors
 
 
-def hidden_freedom(sums: Array, weights: Array, frame: Frame, least: float) -> Freedom:
-    """What moments do not show of a frame: all whose curvature is not above `least`."""
-    values, vectors = curvature_in_parent(sums, weights, frame)
-    hidden = vectors[:, values <= least]
-    return Freedom.of((hidden @ hidden.T)[None], frame.p[None])
-
-
 def nearest(sums: Array, weights: Array, frame: Frame, to: Frame, freedom: Freedom) -> Frame:
     """Of the frames that explain the data as this one does, the nearest to another.
 
@@ -212,3 +214,86 @@ def nearest(sums: Array, weights: Array, frame: Frame, to: Frame, freedom: Freed
         if frame.distance(before) < SMALLEST_STEP:
             break
     return frame
+
+
+class Evidence(NamedTuple):
+    """What is known of one joint.
+
+    Attributes:
+        sums, clean: (3, 15, 15) moments of so many samples, and what of them is motion.
+        rank: directions known. least: curvature above which a direction follows the data.
+        still: whether ADAM has arrived where the gradient leads it.
+    """
+
+    sums: Array
+    clean: Array
+    samples: float
+    rank: int
+    least: float
+    still: bool
+
+
+class SchemaCheck:
+    """Looks at every joint once in so many looks, and rarely solves for one.
+
+    Args:
+        n: joints.
+
+    Attributes:
+        misfit: (n,) what each frame left unexplained when it was last looked at.
+        passed_at, passed_rank: (n,) samples and directions shown when it was last found right.
+        turn: the number of the next look.
+        restarts: joints that were started anew so far.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.misfit = np.full(n, np.inf)
+        self.passed_at, self.passed_rank = np.zeros(n), np.full(n, -1)
+        self.turn = self.restarts = 0
+
+    def next_joints(self, ranks: np.ndarray | None) -> list[int]:
+        """The joints that this look is at.
+
+        Args:
+            ranks: (n,) directions shown where λ stands still, waiting for its check alone: then a
+                joint that has not been found right with them comes out of turn.
+        """
+        joints = list(range(self.turn, len(self.misfit), LOOKS))
+        self.turn = (self.turn + 1) % LOOKS
+        if ranks is not None:
+            joints += [int(j) for j in np.flatnonzero(self.passed_rank != ranks)[:1]]
+        return joints
+
+    def better(self, j: int, frame: Frame, start: Frame, known: Evidence) -> Frame | None:
+        """Where joint j is to start anew; None where it is right, or still on its way.
+
+        Args:
+            frame: where it stands; start: where it stays in what the data do not show.
+        """
+        misfit, before = log_misfit(known.sums, known.samples, frame), self.misfit[j]
+        self.misfit[j] = misfit
+        due = known.rank != self.passed_rank[j] or known.samples > AGAIN * self.passed_at[j]
+        if not due or (misfit < before - 0.2 and not known.still):  # ADAM is on its way
+            return None
+        found = self._solved(frame, start, known, misfit)
+        self.passed_at[j], self.passed_rank[j] = known.samples, known.rank
+        if found is not None:
+            self.misfit[j] = log_misfit(known.sums, known.samples, found)
+            self.restarts += 1
+        return found
+
+    @staticmethod
+    def _solved(frame: Frame, start: Frame, known: Evidence, misfit: float) -> Frame | None:
+        """The closed form's frame where it is clearly better."""
+        sums, count = known.sums, known.samples
+        found, _ = best_frame(sums, profiled_weights(sums, count, frame), frame)
+        weights = profiled_weights(sums, count, found)
+        found, _ = descend(sums, weights, found)
+        if log_misfit(sums, count, found) > misfit - CLEARLY_BETTER:
+            return None
+        weights = profiled_weights(sums, count, found)
+        values, vectors = curvature_in_parent(known.clean, weights, found)
+        hidden = vectors[:, values <= known.least]  # what the data do not show
+        freedom = Freedom.of((hidden @ hidden.T)[None], found.p[None])
+        held = nearest(sums, weights, found, start, freedom)
+        return held if log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else found

@@ -89,15 +89,10 @@ class Estimate:
 
     def way_from(self, start: Estimate) -> tuple[Array, Array]:
         """(P,) the step from a start to here, and its slopes (P, P) as steps from here go on."""
-        turns = [
-            log_rotation(np.swapaxes(a, 1, 2) @ b)
-            for a, b in ((start.R0, self.R0), (start.turn, self.turn))
-        ]
-        own = (
-            turns[1],
-            *(getattr(self, x) - getattr(start, x) for x in ("place", "w_bias", "a_bias")),
-            (self.late_s - start.late_s)[:, None],
-        )
+        both = (start.R0, self.R0), (start.turn, self.turn)
+        turns = [log_rotation(np.swapaxes(a, 1, 2) @ b) for a, b in both]
+        apart = [getattr(self, x) - getattr(start, x) for x in ("place", "w_bias", "a_bias")]
+        own = turns[1], *apart, (self.late_s - start.late_s)[:, None]
         frames = np.concatenate([turns[0], self.p - start.p], axis=1)
         way = np.r_[frames.ravel(), np.concatenate(own, axis=1).ravel()]
         slopes, n = np.eye(len(way)), len(self.p)

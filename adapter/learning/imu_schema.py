@@ -83,11 +83,8 @@ class ImuSchema(Schema):
             self._since_ns = int(stamps[0])
         t_s = 1e-9 * (stamps - self._since_ns)
         motion = table[:, self.layout.motion].reshape(len(table), -1, 12)[:, list(self._links)]
-        rows = (
-            t_s[:, None],
-            table[:, self.layout.motion_q],
-            motion[..., :9].reshape(len(table), -1),
-        )
+        told = motion[..., :9].reshape(len(table), -1)
+        rows = t_s[:, None], table[:, self.layout.motion_q], told
         self._tables.append(np.concatenate(rows, axis=1))
         steps = np.diff(t_s, prepend=self._last_s)
         self._last_s = float(t_s[-1])

@@ -107,11 +107,8 @@ class Windows:
                 starts.append(size + np.arange(0, len(piece) - len(BELL) + 1, PER_KNOT))
                 kept.append(piece)
                 size += len(piece)
-        none = np.zeros(0)
-        return cls(
-            np.concatenate(kept) if kept else none,
-            np.concatenate(starts) if starts else none.astype(int),
-        )
+        none = [np.zeros(0)]
+        return cls(np.concatenate(kept or none), np.concatenate(starts or none).astype(int))
 
     def whole(self, heard: np.ndarray) -> np.ndarray:
         """(k,) windows in all of which something was heard, from (g,)."""

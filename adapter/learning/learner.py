@@ -331,10 +331,8 @@ class OnlineLearner:
     def sound(self, table: Array) -> Array:
         """The states of a table that can be learned from."""
         if table.shape[1] != self.layout.size:
-            raise ModelError(
-                f"a state of this tree has {self.layout.size} numbers (StateLayout), "
-                f"got {table.shape[1]}"
-            )
+            said = f"{self.layout.size} numbers (StateLayout), got {table.shape[1]}"
+            raise ModelError(f"a state of this tree has {said}")
         if not count_beyond(table, self._cap):
             return table
         sound = (np.abs(table[:, 1:]) < self._cap[1:]).all(axis=1)  # false for NaN

@@ -80,12 +80,8 @@ def learned_posterior(
     memory = np.full(n, MEMORY_S[0]) if memory_s is None else memory_s
     sums, counts = _sums(theta, way, way @ start), np.maximum(theta.moments.counts, 1.0)
     nowhere = np.zeros((0, n, len(std))), np.zeros((0, n))
-    part = Part(
-        Moments(period_s, counts, *sums, nowhere),
-        np.arange(len(std)),
-        np.ones(n, dtype=bool),
-        memory,
-    )
+    moments = Moments(period_s, counts, *sums, nowhere)
+    part = Part(moments, np.arange(len(std)), np.ones(n, dtype=bool), memory)
     worth, before = min(theta.noise_gain * period_s / float(memory.mean()), 1.0), None
     if spare:  # what was told before the change, counted as what came after it is
         H, rhs = (worth * x for x in theta.told_before())

@@ -20,25 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from adapter.learning.frame_fit import Frame
-from adapter.learning.schema_check import Evidence, SchemaCheck
-from adapter.learning.schema_kernels import (
-    Count,
-    MotionMoments,
-    absorb,
-    carry_spin,
-    descend,
-    directions,
-    distances,
-    finish,
-    moved,
-    profiled,
-    residual_variance,
-    retract,
-    steepest,
-    strayed,
-    without_noise,
-)
+from adapter.learning import schema_kernels as kernels
+from adapter.learning.frame_fit import Evidence, Frame, SchemaCheck
 from adapter.learning.settings import SchemaSettings
 from adapter.model.spatial import (
     Array,
@@ -120,13 +103,13 @@ class Schema:
         self.start_lam = self.lam
         self.kind = LinkMotionKind.NONE  # taken from the first state that has link motion
         newest = n if each_sample or settings.forget_s is not None else 0
-        self.moments = MotionMoments(
+        self.moments = kernels.MotionMoments(
             np.zeros((n, 3, 15, 15)),
             np.zeros((newest, 3, 15, 15)),
             np.zeros((n + 1, 4)),
             np.zeros((3, n + 1, 12)),
             np.array([-(2**61), 2**62]),  # before any stamp: the first sample follows none
-            np.zeros(len(Count)),
+            np.zeros(len(kernels.Count)),
         )
         self._moments = tuple(self.moments)
         self._clean = np.zeros_like(self.moments.M)
@@ -172,7 +155,7 @@ class Schema:
     @property
     def count(self) -> float:
         """Samples in the moments (fewer where some were forgotten)."""
-        return float(self.moments.counts[Count.SAMPLES])
+        return float(self.moments.counts[kernels.Count.SAMPLES])
 
     def absorb(self, table: Array) -> None:
         """Add a table (m, size) of filtered states to the moments."""
@@ -186,9 +169,11 @@ class Schema:
         base = self._base_motion()
         if not self.settings.spin_measured and self.kind == LinkMotionKind.MEASURED:
             table = table.copy()
-            carry_spin(self._frames, base, table)
+            kernels.carry_spin(self._frames, base, table)
         keep = self._keep(1e3 * self.settings.forget_s) if self.settings.forget_s else 1.0
-        absorb(self._frames, base, table, self._moments, float(self.kind), (keep, self.weight))
+        kernels.absorb(
+            self._frames, base, table, self._moments, float(self.kind), (keep, self.weight)
+        )
 
     def steady(self, table: Array) -> int:
         """How many states (m, size) go by until more is due than steps and looks."""
@@ -258,12 +243,12 @@ class Schema:
         of v, w and a at most half of what the fit leaves, the other half being the child's own
         noise.
         """
-        moments, differences = self.moments, self.moments.counts[Count.DIFFERENCES]
+        moments, differences = self.moments, self.moments.counts[kernels.Count.DIFFERENCES]
         if self.kind != LinkMotionKind.MEASURED or differences < 50:  # too few to tell
             return np.zeros_like(moments.noise_power)
         found = moments.noise_power / (THIRD_DIFFERENCE_GAIN * differences)
         left = np.empty((len(self.p), 3))
-        residual_variance(self._frames, moments.M, self.count, left)
+        kernels.residual_variance(self._frames, moments.M, self.count, left)
         for j, i in enumerate(self._parent):
             # channels are w, v, a
             found[i + 1, :3] = np.minimum(found[i + 1, :3], 0.5 * left[j, [1, 0, 2]])
@@ -281,16 +266,16 @@ class Schema:
             clean = moments.M
             if self.kind == LinkMotionKind.MEASURED:
                 clean, noise = self._clean, self.noise_variance()
-                without_noise(self._parent, moments.M, moments.counts, noise, clean)
-            profiled(frames, moments.M, self.count, clean, self.gradient, self.information)
+                kernels.without_noise(self._parent, moments.M, moments.counts, noise, clean)
+            kernels.profiled(frames, moments.M, self.count, clean, self.gradient, self.information)
             self._judge()
         if self.each_sample:
-            steepest(frames, moments.newest, self.gradient)
+            kernels.steepest(frames, moments.newest, self.gradient)
         elif looking:
-            distances(self._inverse, self.count, self.gradient, self._distance)
+            kernels.distances(self._inverse, self.count, self.gradient, self._distance)
         else:
             outputs = self.gradient, self._distance
-            descend(frames, moments.M, self.count, self._inverse, *outputs)
+            kernels.descend(frames, moments.M, self.count, self._inverse, *outputs)
         if self._rough and self.count >= CARRIED_SAMPLES:
             # begin anew where the frames that carried dw were not yet those of now
             turned = log_rotation(np.swapaxes(self._then, 1, 2) @ self.R0)
@@ -311,10 +296,12 @@ class Schema:
             everywhere = np.zeros_like(self._may_move)
             everywhere[:, 0] = np.eye(6)
             unlimited = np.tile([np.inf, 0.0], (len(self.p), 1))
-            retract(self._frames, self.tangent, everywhere, unlimited, (s.sample_rate, 1.0, rate))
+            kernels.retract(
+                self._frames, self.tangent, everywhere, unlimited, (s.sample_rate, 1.0, rate)
+            )
         else:
             pace = s.rate, s.share, rate
-            retract(self._frames, self.tangent, self._may_move, self._distance, pace)
+            kernels.retract(self._frames, self.tangent, self._may_move, self._distance, pace)
 
     @property
     def _exact(self) -> bool:
@@ -335,7 +322,7 @@ class Schema:
         stds = (0.0, 0.0) if self._exact else (1.0, 3.0)  # standard deviations that may be left
         goals = self.settings.distance_goal, *stds
         out = self._may_move, self._inverse, self._left, self.ranks, self._there
-        self.rank = directions(tuple(curvature), self._limits, goals, self.gradient, out)
+        self.rank = kernels.directions(tuple(curvature), self._limits, goals, self.gradient, out)
         np.add(self._may_move[:, 0], self._may_move[:, 1], out=self.identifiable)
         self.certain[:] = self._may_move[:, 0]
         same = self.ranks.any() and bool((self.ranks == before).all())
@@ -347,7 +334,7 @@ class Schema:
     def _settle(self) -> None:
         """Mend what stands wrong, and say whether λ has converged."""
         if self._exact:  # ADAM forgets the large gradients of its way too slowly to come close soon
-            finish(self._frames, self._left, NEAR, self.gradient)
+            kernels.finish(self._frames, self._left, NEAR, self.gradient)
         else:
             # Steps keep out of shifts that the data do not show, but while noise still tilts the
             # picture of what is shown, a little leaks into them: back to where they started.
@@ -396,9 +383,9 @@ class Schema:
         Sines of the turns; inf for more than a quarter turn.
         """
         by = np.empty((len(p), 6))
-        moved(self._frames, R0, p, by)
+        kernels.moved(self._frames, R0, p, by)
         return by
 
     def strayed(self, R0: Array, p: Array, allowed: Array) -> bool:
         """Whether a frame has left others by more than (n, 6), see `moved_from`."""
-        return bool(strayed(self._frames, R0, p, allowed))
+        return bool(kernels.strayed(self._frames, R0, p, allowed))

@@ -26,22 +26,9 @@ from adapter.effects.base import LearnedEffect
 from adapter.effects.by_joint import AT_REST, JointSignals, slowness
 from adapter.effects.catalogue import effects_by_name
 from adapter.judgement.noise import MEMORY_S
+from adapter.learning import theta_kernels as kernels
 from adapter.learning.known_effects import believed, told_shapes
 from adapter.learning.settings import LearnerSettings, Mode
-from adapter.learning.theta_kernels import (
-    Given,
-    Moments,
-    Prior,
-    Rows,
-    Weighing,
-    absorb,
-    add_information,
-    follow,
-    gradient,
-    joint_costs,
-    unfolded,
-    values,
-)
 from adapter.model.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
@@ -184,27 +171,26 @@ class Theta:
         self._places = self.rows.place.copy(), self.rows.base_place.copy()
         self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
         self.moments, self.newest = self.empty_moments(), self.empty_moments()
+        self._forgetting = 1e-3 / (self.settings.forget_s or np.inf)  # rate per sample
         self.count, self.weight = 0.0, 1.0
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
         self.drums = np.array([x.drums(tree.slides) for x in self.effects]).reshape(e, n)
-        nothing: Array = np.full((e, n), np.nan)
-        told = believed(known.effects, settings.effects, n)
-        self.believed = told or (nothing, nothing)
+        nothing: Array = np.full((2, e, n), np.nan)
+        self.believed = believed(known.effects, settings.effects, n) or tuple(nothing)
         self._set_prior(*self._neutral_prior())
         self.x, self.gradient = np.zeros((2, self.P))
         self.x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
         self.x[self._effects_from :] = np.nan_to_num(self.believed[0]).ravel() / self.rows.steps
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
         tool = np.zeros(10) if known.tool_theta is None else np.array(known.tool_theta)
-        self._given = tuple(Given(base, tool, np.array([hand]), self.th))
+        self._given = tuple(kernels.Given(base, tool, np.array([hand]), self.th))
         self._work = np.zeros(self.P), np.zeros(self.P)
         self.updates = 0
+        usual = REAL_MODEL_ERROR if self.effects else IDEAL_MODEL_ERROR
         error = self.settings.model_error
-        if error is None:
-            error = REAL_MODEL_ERROR if self.effects else IDEAL_MODEL_ERROR
-        self.model_variance = error**2
+        self.model_variance = (usual if error is None else error) ** 2
         self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
         self.rests = np.ones(n)
@@ -230,9 +216,8 @@ class Theta:
     def effect_columns(self, table: Array) -> Array:
         """(m, c, n) columns of the effects for states (m, size), or their `before_links`."""
         at = self.layout.signals(table, self.smoothing_s)
-        columns = [column for effect in self.effects for column in effect.basis(at)]
-        out = np.empty((len(table), len(columns), self.tree.n))
-        for k, column in enumerate(columns):
+        out = np.empty((len(table), self.columns, self.tree.n))
+        for k, column in enumerate(x for effect in self.effects for x in effect.basis(at)):
             out[:, k] = column
         return out
 
@@ -241,14 +226,14 @@ class Theta:
         pairs = zip(self.effects, self.shapes, strict=True)
         return [effect.torque_per_unit(at, shape) for effect, shape in pairs]
 
-    def empty_moments(self) -> Moments:
+    def empty_moments(self) -> kernels.Moments:
         """Moments of no samples, to be filled by `absorb` and put in place by `replace_moments`."""
         widths = self.rows.sizes + 1
         A = np.zeros(int((widths * (widths + 1) // 2).sum()))
         floating = int(self.tree.floating)
         C = np.zeros((2 * floating, len(self.rows.near), len(self.rows.base_place) + 1))
         level = np.zeros(6 * floating), np.array([0.0, 2000.0])  # samples it spans
-        return Moments(A, C, *level, np.zeros(self.tree.n))
+        return kernels.Moments(A, C, *level, np.zeros(self.tree.n))
 
     def absorb(self, frames: tuple[Array, Array], table: Array) -> Array:
         """Add samples to the moments.
@@ -263,35 +248,31 @@ class Theta:
         """
         error = self._absorb(frames, table, self.moments, self.weight)
         if self.each_sample:
-            newest = self.newest
-            newest.A[:], newest.C[:] = 0.0, 0.0
-            self._absorb(frames, table[-1:], Moments(newest.A, newest.C, *_NO_LEVEL, _NOTHING))
+            A, C = self.newest[:2]
+            A[:], C[:] = 0.0, 0.0
+            self._absorb(frames, table[-1:], kernels.Moments(A, C, *_NO_LEVEL, _NOTHING))
         self.count += self.weight * len(table)
         return error
 
-    def absorb_again(self, frames: tuple[Array, Array], table: Array, into: Moments) -> None:
+    def absorb_again(
+        self, frames: tuple[Array, Array], table: Array, into: kernels.Moments
+    ) -> None:
         """Add samples seen before to other moments, see `replace_moments`."""
-        self._absorb(frames, table, Moments(into.A, into.C, *_NO_LEVEL, into.counts))
+        self._absorb(frames, table, kernels.Moments(into.A, into.C, *_NO_LEVEL, into.counts))
 
     def errors(self, frames: tuple[Array, Array], table: Array) -> Array:
         """Torque errors (m, rows) of the parameters in use; nothing is learned."""
-        nowhere = Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL, _NOTHING)
+        nowhere = kernels.Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL, _NOTHING)
         return self._absorb(frames, table, nowhere)
 
     def _absorb(
-        self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
+        self, frames: tuple[Array, Array], table: Array, into: kernels.Moments, weight: float = 1.0
     ) -> Array:
         columns, placed = self.effect_columns(table), (self._parent, *frames, self._slides)
         sums = tuple(into), self._forgetting, weight, self.rests
-        return absorb(placed, self._rows, self._given, table, columns, sums)
+        return kernels.absorb(placed, self._rows, self._given, table, columns, sums)
 
-    @property
-    def _forgetting(self) -> float:
-        """Rate per sample."""
-        forget_s = self.settings.forget_s
-        return 0.0 if forget_s is None else 1e-3 / forget_s
-
-    def replace_moments(self, moments: Moments, count: float) -> None:
+    def replace_moments(self, moments: kernels.Moments, count: float) -> None:
         """Put moments rebuilt with a better λ in place of the old ones.
 
         What was folded into the prior at a change cannot be rebuilt; it counts half from here on.
@@ -309,7 +290,7 @@ class Theta:
         # first and one behind the last column that is not zero, of each row
         self._ranges = np.stack([np.where(some, first, 0), np.where(some, last, 0)], axis=1)
         self.prior, self.prior_rhs = H, rhs
-        self._before = tuple(Prior(H, rhs, self._ranges, 1.0))
+        self._before = tuple(kernels.Prior(H, rhs, self._ranges, 1.0))
 
     def parts(self, frames: tuple[Array, Array], settled: bool) -> tuple[Any, ...]:
         """What `steps` needs of it; `settled` as for `after_step`."""
@@ -352,11 +333,11 @@ class Theta:
             data, counts = self.newest[:2], np.ones(self.tree.n)
             floor, floor_count = np.ones_like(floor), 1e9
             H, rhs = 1e-6 * self.prior, 1e-6 * self.prior_rhs
-            prior = tuple(Prior(H, rhs, self._ranges, 1e-6))
+            prior = tuple(kernels.Prior(H, rhs, self._ranges, 1e-6))
         base = self.base_weights()
-        weighing = Weighing(counts, self.noise_gain, floor, floor_count, least, base, self.share)
+        weighing = counts, self.noise_gain, floor, floor_count, least, base, self.share
         out = *self._work, self.gradient
-        gradient(self.x, self._rows, data, prior, tuple(weighing), out)
+        kernels.gradient(self.x, self._rows, data, prior, weighing, out)
         return True
 
     def base_weights(self) -> Array:
@@ -392,7 +373,7 @@ class Theta:
         if min_eigenvalue(link + load) <= 0.0:
             return
         self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
         self.updates = 0
 
     def after_step(self, settled: bool, samples: float = 1.0) -> None:
@@ -400,14 +381,14 @@ class Theta:
         self.updates += 1
         s = self.settings
         span = max((s.settled_average if settled else s.average) / samples, 1.0)
-        follow(self.x, float(min(self.updates, span)), self.rows.steps, self.mean, self.th)
+        kernels.follow(self.x, float(min(self.updates, span)), self.rows.steps, self.mean, self.th)
 
     def variance(self, th: Array | None = None) -> Array:
         """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)².
 
         The residual is that of the parameters in use, or of others, th (P,).
         """
-        cost = joint_costs(self._rows, self.th if th is None else th, self.moments.A)
+        cost = kernels.joint_costs(self._rows, self.th if th is None else th, self.moments.A)
         own = (cost + self.floor_count * self.floor) / (self.moments.counts + self.floor_count)
         return np.asarray(own + self.model_variance)
 
@@ -418,7 +399,7 @@ class Theta:
             A: of other moments than the present ones, see `Moments`.
         """
         moments = self.moments.A if A is None else A
-        return np.asarray(unfolded(moments, self.rows.starts[j], self.rows.sizes[j] + 1))
+        return np.asarray(kernels.unfolded(moments, self.rows.starts[j], self.rows.sizes[j] + 1))
 
     def information(self) -> tuple[Array, Array]:
         """All that is known of (θ, effects): information matrix (P, P) and right side (P,).
@@ -446,12 +427,12 @@ class Theta:
             weights: (n,) of a sample of each joint, see `weights`.
         """
         H, rhs = np.zeros((self.P, self.P)), np.zeros(self.P)
-        add_information(self._rows, A, weights, H, rhs)
+        kernels.add_information(self._rows, A, weights, H, rhs)
         return H, rhs
 
     def costs(self, th: Array, A: Array) -> Array:
         """(n,) sums of squared torque errors of parameters th (P,) over the samples in A."""
-        return np.asarray(joint_costs(self._rows, th, A))
+        return np.asarray(kernels.joint_costs(self._rows, th, A))
 
     def weights(self) -> Array:
         """(n,) information of a sample of each joint's torque, 1/(N m)²."""
@@ -510,17 +491,15 @@ class Theta:
         variance = diagonal[self._effects_from :].reshape(-1, n) / self.drums**2
         widest = np.array([effect.learned_std for effect in self.effects])
         values, free = self.effect_values / self.drums, np.isnan(self.believed[0])
-        shares = [
-            self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
-        ]
+        ends = zip(self.rows.share, self.rows.sizes, strict=True)
+        shares = [share[size - self.columns : size] for share, size in ends]
         first = [own.start for own in self.own]
         # whether an effect acts at all; of one that does not no data speak
         acting = np.add.reduceat(np.array(shares), first, axis=1).T > 0.0
+        told = zip(values, variance, free, acting, self.effect_spread, strict=True)
         found = [
             likely_spread(x[f & on], v[f & on], before) if (f & on).any() else before * f.any()
-            for x, v, f, on, before in zip(
-                values, variance, free, acting, self.effect_spread, strict=True
-            )
+            for x, v, f, on, before in told
         ]
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(self._effects_from, self.P)
@@ -596,7 +575,7 @@ class Theta:
                 if not there:
                     own = self._effects_from + k * self.tree.n + j
                     self.x[own] = self.mean[own] = 0.0
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
 
     def _reduced(
         self, j: int, k: int, weight: float, known: tuple[Array, Array]
@@ -767,11 +746,10 @@ class Theta:
         self.moments.A[:], self.moments.C[:], self.count = 0.0, 0.0, 0.0
         self.moments.counts[:] = 0.0
         self.x[spare] = self.mean[spare] = self.mean[hand]
-        values(self.mean, self.rows.steps, self.th)
+        kernels.values(self.mean, self.rows.steps, self.th)
         # columns of the hand are the spare body's from here on
-        for place, before in zip(
-            (self.rows.place, self.rows.base_place), self._places, strict=True
-        ):
+        places = self.rows.place, self.rows.base_place
+        for place, before in zip(places, self._places, strict=True):
             moved = (before >= hand.start) & (before < hand.stop)
             place[:] = np.where(moved, before + spare.start - hand.start, before)
         self.spare_in_use = True
@@ -802,7 +780,7 @@ def likely_spread(x: Array, variance: Array, spread: float) -> float:
     return math.sqrt(square)
 
 
-def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
+def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> kernels.Rows:
     """Which parameters each torque row of a tree touches, those of effects beside θ."""
     n, first = tree.n, int(tree.floating)
     bodies = tree.bodies + 1
@@ -827,13 +805,5 @@ def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
     for j, size in enumerate(sizes):  # nothing is known of rates at first
         share[j, size - len(owner) : size] = [not effects[k].by_rates for k in owner]
     steps = np.array([effect.step * effect.drums(tree.slides) for effect in effects]).ravel()
-    return Rows(
-        slot,
-        sizes,
-        starts,
-        place,
-        share,
-        every,
-        np.array(near, dtype=np.int64),
-        steps.astype(np.float64),
-    )
+    touched = np.array(near, dtype=np.int64)
+    return kernels.Rows(slot, sizes, starts, place, share, every, touched, steps.astype(np.float64))

@@ -35,8 +35,7 @@ def tensor_from_six(six: ArrayLike) -> Array:
 
 def six_from_tensor(tensor: ArrayLike) -> Array:
     """The (..., 6) elements XX XY XZ YY YZ ZZ of symmetric (..., 3, 3) matrices."""
-    out: Array = np.asarray(tensor, dtype=np.float64)[..., _ROWS, _COLS]
-    return out
+    return np.asarray(np.asarray(tensor, dtype=np.float64)[..., _ROWS, _COLS])
 
 
 def pseudo_inertia(theta: ArrayLike) -> Array:

@@ -16,18 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError, ModelWarning
+from adapter.model import spatial
 from adapter.model.inertia import move_theta, theta_from_body
 from adapter.model.mjcf_text import MJCF_PLACES, inertial_attributes, joint_attributes
 from adapter.model.onto import Changes, changes_onto
 from adapter.model.robot_file import FileJoint, FileRobot, Merged
 from adapter.model.self_model import MJCF, SelfModel, Source
-from adapter.model.spatial import (
-    Array,
-    exp_rotation,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    vector3,
-)
 from adapter.model.urdf import file_text
 from adapter.model.urdf_text import STIFFNESS, Additions, number_text
 from adapter.model.xml_edit import Element, XmlText
@@ -65,8 +59,8 @@ def read_mjcf(
     for part in file.unused:
         warnings.warn(f"{path}: {part} is not used", ModelWarning, stacklevel=3)
     merged = Merged(file.robot(), joints, lock)
-    turn = matrix_from_quaternion(compiled.body_quat[file.root])
-    down = turn.T @ compiled.opt.gravity if gravity is None else vector3(gravity)
+    turn = spatial.matrix_from_quaternion(compiled.body_quat[file.root])
+    down = turn.T @ compiled.opt.gravity if gravity is None else spatial.vector3(gravity)
     model = merged.model(floating, down)
     return model, [file.extras(name) for name in model.tree.joint_names]
 
@@ -190,9 +184,8 @@ class MjcfFile:
             links[joint.child] = self._theta(i)
             joints[joint.name] = joint
         name = self.compiled.names.split(b"\0")[0].decode() or self.path.stem
-        return FileRobot(
-            str(self.path), name, links, joints, Source(MJCF, str(self.path.resolve()))
-        )
+        source = Source(MJCF, str(self.path.resolve()))
+        return FileRobot(str(self.path), name, links, joints, source)
 
     def extras(self, name: str) -> dict[str, float]:
         """What a joint has beside the rigid arm, by MuJoCo's names; zeros left out."""
@@ -230,12 +223,8 @@ class MjcfFile:
         counted = HINGE if (m.jnt_type == HINGE).any() else SLIDE
 
         def hinges(root: int) -> int:
-            return sum(
-                m.jnt_type[j] == counted
-                for i in range(m.nbody)
-                if root in over[i]
-                for j in self._joints_in(i)
-            )
+            below = (j for i in range(m.nbody) if root in over[i] for j in self._joints_in(i))
+            return sum(m.jnt_type[j] == counted for j in below)
 
         if floating:
             if not free:
@@ -248,26 +237,22 @@ class MjcfFile:
             root = tops[0] if alone else 0
         dropped = [i for i in free if i != root]
         self.unused += [f"free body '{self._name(i)}'" for i in dropped]
-        below = [
-            i
-            for i in range(m.nbody)
-            if root in over[i] and i != root and not any(x in dropped for x in over[i])
-        ]
-        return root, below
+        below = [i for i in range(m.nbody) if root in over[i] and i != root]
+        return root, [i for i in below if not any(x in dropped for x in over[i])]
 
-    def _theta(self, body: int) -> Array:
+    def _theta(self, body: int) -> spatial.Array:
         """θ (10,) of a body in the frame of its link."""
         m = self.compiled
         if body == 0:
             return np.zeros(10)
         own = theta_from_body(m.body_mass[body], np.zeros(3), np.diag(m.body_inertia[body]))
-        turn = matrix_from_quaternion(m.body_iquat[body])
+        turn = spatial.matrix_from_quaternion(m.body_iquat[body])
         return move_theta(own, turn, m.body_ipos[body] - self.anchor[body])
 
     def _joint(self, body: int) -> FileJoint:
         """How a body hangs on the one that carries it, at joint angle zero."""
         m, parent = self.compiled, self._parents[body]
-        turn = matrix_from_quaternion(m.body_quat[body])
+        turn = spatial.matrix_from_quaternion(m.body_quat[body])
         place = m.body_pos[body] + turn @ self.anchor[body] - self.anchor[parent]
         name, kind, axis = f"{self._name(body)}_fixed", "fixed", np.array([0.0, 0.0, 1.0])
         limits, mimic = np.full(4, np.nan), None
@@ -277,13 +262,13 @@ class MjcfFile:
             if kind == "prismatic":
                 place = place - turn @ axis * self.zero(body)
             if kind == "revolute":
-                turn = turn @ exp_rotation(-self.zero(body) * axis)
+                turn = turn @ spatial.exp_rotation(-self.zero(body) * axis)
             if m.jnt_type[j] in (SLIDE, HINGE):
                 limits, mimic = self._limits(j), self._followed(j)
         parent_name, own = self._name(parent), self._name(body)
         return FileJoint(name, kind, parent_name, own, turn, place, axis, limits, mimic)
 
-    def _limits(self, joint: int) -> Array:
+    def _limits(self, joint: int) -> spatial.Array:
         """[lower upper velocity effort] of a joint, NaN where not given."""
         m, out = self.compiled, np.full(4, np.nan)
         if m.jnt_limited[joint]:
@@ -331,7 +316,7 @@ class _Writer:
             if new:
                 self._joint(joints[name].child, new)
 
-    def _place(self, joint: FileJoint, rotation: Array, position: Array) -> None:
+    def _place(self, joint: FileJoint, rotation: spatial.Array, position: spatial.Array) -> None:
         """Where a body stands in its parent, from where its link does at joint angle zero."""
         m, element = self.file.compiled, self._element(joint.child)
         if element.parent is not None and element.parent.tag not in ("body", "worldbody"):
@@ -341,16 +326,16 @@ class _Writer:
             )
         body, parent = m.body(joint.child).id, m.body(joint.parent).id
         way, anchor = self.file.zero(body) * joint.axis, self.file.anchor
-        turn = rotation @ exp_rotation(way) if joint.kind == "revolute" else rotation
+        turn = rotation @ spatial.exp_rotation(way) if joint.kind == "revolute" else rotation
         place = position + anchor[parent] - turn @ anchor[body]
         if joint.kind == "prismatic":
             place = place + rotation @ way
         self.xml.set(element, "pos", number_text(place))
-        self.xml.set(element, "quat", number_text(quaternion_from_matrix(turn)))
+        self.xml.set(element, "quat", number_text(spatial.quaternion_from_matrix(turn)))
         for key in OTHER_TURNS:
             self.xml.drop(element, key)
 
-    def _body(self, name: str, theta: Array) -> None:
+    def _body(self, name: str, theta: spatial.Array) -> None:
         """<inertial> of a body, from θ (10,) in its link's frame."""
         element, body = self._element(name), self.file.compiled.body(name).id
         values = inertial_attributes(move_theta(theta, np.eye(3), self.file.anchor[body]))

@@ -178,10 +178,8 @@ class _Writer:
                 self.xml.set(key, "ctrl", number_text([*values, *[0.0] * len(speeds)]))
         self._add("actuator", [*new, *speeds])
         if speeds:
-            self.notes.append(
-                "the servos use the command's speed, which MuJoCo does not derive: give it, rad/s, "
-                f"to the actuators JOINT{SPEED}"
-            )
+            note = "the servos use the command's speed, which MuJoCo does not derive: give it, "
+            self.notes.append(f"{note}rad/s, to the actuators JOINT{SPEED}")
 
     def _kept(self, old: Element) -> dict[str, Any]:
         """Of an actuator that is written anew: its name, and the force that it can give."""
@@ -201,10 +199,8 @@ class _Writer:
         except MeansError:
             known = False
         if not known:
-            self.notes.append(
-                "the installed MuJoCo knows no delay of actuators: give commands "
-                f"{1e3 * delay_s:.2f} ms late"
-            )
+            late = f"give commands {1e3 * delay_s:.2f} ms late"
+            self.notes.append(f"the installed MuJoCo knows no delay of actuators: {late}")
             return {}
         # Between two samples by a line, a command begins to act half a step before its time.
         late_s = delay_s + 0.5 * self.step_s

@@ -242,12 +242,10 @@ def _plain(value: Any) -> Any:
     """Effects and provenance as JSON holds them: numpy's types made Python's, NaN as None."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         return _plain(value.tolist())
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
     return _numbers(value) if isinstance(value, float) else value
 
 

@@ -188,26 +188,20 @@ def _root(robot: FileRobot) -> str:
     for joint in robot.joints.values():
         if joint.child in parent_of:
             both = f"'{parent_of[joint.child].name}' and '{joint.name}'"
-            raise ModelError(
-                f"{robot.file}: link '{joint.child}' is the child of joints {both}; a loop can't "
-                "be read, remove one of them"
-            )
+            said = f"is the child of joints {both}; a loop can't be read, remove one of them"
+            raise ModelError(f"{robot.file}: link '{joint.child}' {said}")
         parent_of[joint.child] = joint
     roots = [name for name in robot.links if name not in parent_of]
     if len(roots) > 1:
-        raise ModelError(
-            f"{robot.file}: {len(roots)} root links ({', '.join(roots)}); a robot has one, join "
-            "them with fixed joints"
-        )
+        said = f"({', '.join(roots)}); a robot has one, join them with fixed joints"
+        raise ModelError(f"{robot.file}: {len(roots)} root links {said}")
     for name in robot.links:
         seen = [name]
         while seen[-1] in parent_of:
             seen.append(parent_of[seen[-1]].parent)
             if seen[-1] in seen[:-1]:
-                raise ModelError(
-                    f"{robot.file}: links {' -> '.join(reversed(seen))} form a loop; a tree is "
-                    "needed"
-                )
+                said = f"{' -> '.join(reversed(seen))} form a loop; a tree is needed"
+                raise ModelError(f"{robot.file}: links {said}")
     return roots[0]
 
 
@@ -226,18 +220,13 @@ def _moving(robot: FileRobot, wanted: Sequence[str] | None, lock: Mapping[str, f
             value, leader = robot.value(joint, chosen, lock), robot.leader(joint)
             follows = f" and mimics {leader}" if joint.mimic else ""
             if leader in chosen:
-                follows += (
-                    ", which moves (no model here follows; what it takes is not in its leader)"
-                )
+                why = "no model here follows; what it takes is not in its leader"
+                follows += f", which moves ({why})"
             at = "zero" if value == 0.0 else f"{value:.6g}"
             finger = joint in own and wanted is None
             what = ", of a gripper as it seems (--joints A,B,... frees it)" if finger else ""
-            warnings.warn(
-                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}{what}; "
-                f"locked at {at}",
-                ModelWarning,
-                stacklevel=6,
-            )
+            said = f"joint '{joint.name}' is {joint.kind}{follows}{what}; locked at {at}"
+            warnings.warn(f"{robot.file}: {said}", ModelWarning, stacklevel=6)
     return chosen
 
 
@@ -356,10 +345,8 @@ class Merged:
             if body.theta[0] <= 0.0:
                 rest = f" (with {', '.join(body.merged)})" if body.merged else ""
                 joint = f"leave joint '{body.joint.name}' out" if body.joint else "fix the base"
-                raise ModelError(
-                    f"{file}: moving link '{body.name}'{rest} has no mass; give it an <inertial> "
-                    f"or {joint}"
-                )
+                said = f"has no mass; give it an <inertial> or {joint}"
+                raise ModelError(f"{file}: moving link '{body.name}'{rest} {said}")
         told = [(b, *((b.joint.name, b.joint.kind) if b.joint else ("", ""))) for b in moving]
         bodies = [(b.name, j, b.parent + floating, b.theta, k in SLIDING) for b, j, k in told]
         check_moving(file, bodies)

@@ -250,13 +250,8 @@ class SelfModel:
         return html_table(repr(self), heads, rows) + effects_html(self.effects)
 
     def _check_arrays(self, n: int, bodies: int) -> None:
-        known = {
-            "lam": (n, 6),
-            "theta": (bodies, 10),
-            "axis": (n, 3),
-            "gravity": (3,),
-            "base_theta": (10,),
-        }
+        known: dict[str, tuple[int, ...]] = {"lam": (n, 6), "theta": (bodies, 10), "axis": (n, 3)}
+        known |= {"gravity": (3,), "base_theta": (10,)}
         maybe = {"lam_std": (n, 6), "theta_std": (bodies, 10)}
         for key, shape in {**known, **maybe}.items():
             value = np.array(getattr(self, key), dtype=np.float64)

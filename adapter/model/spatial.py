@@ -66,8 +66,7 @@ def rot_z(angle: ArrayLike) -> Array:
 def matrix_from_zxz(angles: ArrayLike) -> Array:
     """Rz(α) Rx(β) Rz(γ) of (..., 3) angles [α β γ] (paper, eq. 9 at q = 0), (..., 3, 3)."""
     e = np.asarray(angles, dtype=np.float64)
-    product: Array = rot_z(e[..., 0]) @ rot_x(e[..., 1]) @ rot_z(e[..., 2])
-    return product
+    return np.asarray(rot_z(e[..., 0]) @ rot_x(e[..., 1]) @ rot_z(e[..., 2]))
 
 
 def zxz_from_matrix(rotation: ArrayLike) -> Array:
@@ -96,8 +95,7 @@ def exp_rotation(vector: ArrayLike) -> Array:
     # sinc keeps both series factors exact at zero: sin(x)/x and (1 - cos x)/x² = ½ sinc²(x/2).
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    out: Array = np.eye(3) + first * k + second * (k @ k)
-    return out
+    return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 
 def log_rotation(rotation: ArrayLike) -> Array:
@@ -106,8 +104,7 @@ def log_rotation(rotation: ArrayLike) -> Array:
 
     r = np.asarray(rotation, dtype=np.float64)
     vectors = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec()
-    out: Array = vectors.reshape(r.shape[:-1])
-    return out
+    return np.asarray(vectors.reshape(r.shape[:-1]))
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Array:
@@ -129,15 +126,13 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
     """The rotation (3, 3) of a quaternion [w x y z] (4,) of any length."""
     w, *xyz = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
     k = skew(xyz)
-    out: Array = np.eye(3) + 2.0 * w * k + 2.0 * (k @ k)
-    return out
+    return np.asarray(np.eye(3) + 2.0 * w * k + 2.0 * (k @ k))
 
 
 def rotation_angle(first: ArrayLike, second: ArrayLike) -> Array:
     """Angle (...) between two sets of (..., 3, 3) rotations, rad."""
     relative = np.swapaxes(np.asarray(first, dtype=np.float64), -1, -2) @ np.asarray(second)
-    angle: Array = np.linalg.norm(log_rotation(relative), axis=-1)
-    return angle
+    return np.asarray(np.linalg.norm(log_rotation(relative), axis=-1))
 
 
 def z_to_axis(axis: ArrayLike) -> Array:
@@ -155,15 +150,13 @@ def z_to_axis(axis: ArrayLike) -> Array:
     if sine < 1e-290:  # nothing, or subnormal numbers, which have lost its direction
         return np.eye(3) if u[2] > 0 else np.diag([1.0, -1.0, -1.0])
     k = skew([-u[1] / sine, u[0] / sine, 0.0])
-    out: Array = np.eye(3) + sine * k + (1.0 - u[2]) * (k @ k)
-    return out
+    return np.asarray(np.eye(3) + sine * k + (1.0 - u[2]) * (k @ k))
 
 
 def matrix_from_rpy(rpy: ArrayLike) -> Array:
     """URDF's fixed-axis roll, pitch, yaw (..., 3) as Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3)."""
     a = np.asarray(rpy, dtype=np.float64)
-    product: Array = rot_z(a[..., 2]) @ rot_y(a[..., 1]) @ rot_x(a[..., 0])
-    return product
+    return np.asarray(rot_z(a[..., 2]) @ rot_y(a[..., 1]) @ rot_x(a[..., 0]))
 
 
 def rpy_from_matrix(rotation: ArrayLike) -> Array:

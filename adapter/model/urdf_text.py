@@ -149,11 +149,9 @@ def carried(model: SelfModel, more: Additions) -> tuple[Carried, Carried]:
 
 def unplaced(model: SelfModel, more: Additions) -> list[str]:
     """What a URDF has no place for, in words; its gravity is upright."""
-    upright = np.array_equal(model.gravity, gravity_down())
-    return [
-        *([] if upright else [f"gravity {model.gravity.tolist()} m/s2 in base axes"]),
-        *more.left_out,
-    ]
+    if np.array_equal(model.gravity, gravity_down()):
+        return more.left_out
+    return [f"gravity {model.gravity.tolist()} m/s2 in base axes", *more.left_out]
 
 
 def comment_text(left_out: list[str]) -> str:
@@ -164,9 +162,8 @@ def comment_text(left_out: list[str]) -> str:
 
 def number_text(values: ArrayLike) -> str:
     """Numbers that read back unchanged; a negative zero loses its sign."""
-    return " ".join(
-        repr(float(value) + 0.0) for value in np.atleast_1d(np.asarray(values, dtype=np.float64))
-    )
+    numbers = np.atleast_1d(np.asarray(values, dtype=np.float64))
+    return " ".join(repr(float(value) + 0.0) for value in numbers)
 
 
 def _add_origin(element: ET.Element, rotation: Array, position: Array | None = None) -> None:
@@ -236,9 +233,8 @@ def _add_joint(
     rotation = turns[parent] @ rotation @ turns[child].T
     _add_origin(joint, rotation, turns[parent] @ position)
     ET.SubElement(joint, "axis", xyz=number_text(model.axis[k]))
-    losses = {
-        place: number_text(more.joint[place][k]) for place in more.places if more.joint[place][k]
-    }
+    own = ((place, more.joint[place][k]) for place in more.places)
+    losses = {place: number_text(value) for place, value in own if value}
     if losses:
         ET.SubElement(joint, "dynamics", losses)
     values = {key: getattr(limits, key)[k] for key in LIMITS}

@@ -15,13 +15,7 @@ import numpy as np
 from adapter.model.spatial import Array, matrix_from_zxz, skew
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
-from adapter.physics.kernels import (
-    JointMotion,
-    base_at_rest,
-    frames_of,
-    link_motions,
-    regressors,
-)
+from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, link_motions, regressors
 
 # Singular values below this, relative to the largest, count as zero. Random motion leaves a gap
 # of many decades: true ones stay above 1e-6 on arms, rounding below 1e-14.
@@ -122,10 +116,7 @@ def random_regressor(
 
 
 def base_parameters(
-    tree: Tree,
-    lam: Array,
-    gravity: Array,
-    extra: ExtraColumns | None = None,
+    tree: Tree, lam: Array, gravity: Array, extra: ExtraColumns | None = None
 ) -> BaseParameters:
     """The identifiable subspace of θ, from the regressor over random motion.
 

@@ -97,7 +97,8 @@ def link_step(
         Motion of link j in frame j, (m, 3) each.
     """
     v, w, a, dw = parent
-    q_j, along, ahead = joint[0], _along_z(joint[1]), _along_z(joint[2])
+    q_j, *rates = joint
+    along, ahead = (torch.nn.functional.pad(x[..., None], (2, 0)) for x in rates)  # on z
     p, r0 = placed_at(q_j, lam_j, slides)
     p, cross = p.expand_as(w), torch.linalg.cross
 
@@ -117,11 +118,6 @@ def placed_at(q_j: Tensor, lam_j: Tensor, slides: bool) -> tuple[Tensor, Tensor]
     """Origin of frame j in frame i, (3,) or (m, 3) where the joint slides, and R0 (3, 3)."""
     r0 = joint_rotation(lam_j)
     return (lam_j[3:] + q_j[:, None] * r0[:, 2] if slides else lam_j[3:]), r0
-
-
-def _along_z(x: Tensor) -> Tensor:
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, zero, x], dim=-1)
 
 
 def base_motion(base: Tensor | FrameMotion, like: Tensor) -> FrameMotion:

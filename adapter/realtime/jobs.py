@@ -38,7 +38,6 @@ from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
 from drivers.files.mcap import FLUSH_S, McapWriter
 from drivers.files.messages import Message
 
-UNFINISHED = "next"
 # How often news are published, and how often a recorder tells an estimate, the links' places and
 # what the loop's timing was meanwhile.
 NEWS_S, ESTIMATE_S, FRAMES_S, TIMING_S = 0.25, 0.1, 1.0 / 30.0, 1.0
@@ -209,7 +208,7 @@ class LearnerTask:
         """Keep a state, then give back what it has learned and remove those before it."""
         folder, job, index = self.keep_in, self.job, ring.taken
         assert folder is not None and job.keep is not None
-        place = folder / UNFINISHED
+        place = folder / "next"
         try:
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir()

@@ -5,13 +5,10 @@ from __future__ import annotations
 import copy
 import os
 import select
-import signal
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -25,6 +22,7 @@ from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, Intake, JointSample
+from drivers.process import StopSignals
 
 LOOK_EVERY = 256  # ticks between two looks at the workers
 WALL_SHARE, WALL_EXTRA_S = 1.1, 2.0  # a run whose stamps stand still ends by the clock on the wall
@@ -96,32 +94,6 @@ class LiveResult:
     tracking: dict[str, Any] | None
     intake: Intake
     contacts: list[dict[str, Any]] = field(default_factory=list)
-
-
-class StopSignals:
-    """Counts SIGINT, SIGTERM and SIGHUP in place of their usual effect (main thread only).
-
-    A SIGHUP that is ignored (`nohup`) stays so.
-    """
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> StopSignals:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
-                    continue
-                self._before[number] = signal.signal(number, self._hear)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _hear(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
 
 
 class Deadman:

@@ -7,13 +7,14 @@ deadlines, t0 + k * period: no drift, and a missed one is missed, not postponed.
 from __future__ import annotations
 
 import ctypes
-import errno
 import gc
 import os
 import resource
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+
+from drivers.process import sleep_until
 
 MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
 PRIORITY = 70  # of SCHED_FIFO: above the kernel's interrupt threads (50), below its watchdogs (99)
@@ -117,20 +118,6 @@ def quiet_collector() -> Answer:
 
 
 SPIN_NS = 120_000  # wait actively for so long: waking up takes the system some 50 to 100 µs
-TIMER_ABSTIME = 1  # <time.h>
-_libc = ctypes.CDLL(None, use_errno=True)
-
-
-class _Timespec(ctypes.Structure):
-    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
-def sleep_until(deadline_ns: int) -> None:
-    """Sleep until CLOCK_MONOTONIC shows `deadline_ns`, or until a signal."""
-    at = _Timespec(*divmod(deadline_ns, 1_000_000_000))
-    code = _libc.clock_nanosleep(time.CLOCK_MONOTONIC, TIMER_ABSTIME, ctypes.byref(at), None)
-    if code not in (0, errno.EINTR):
-        raise OSError(code, os.strerror(code))
 
 
 class Clock:

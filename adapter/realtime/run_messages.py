@@ -317,7 +317,13 @@ class RunMessages:
         """Of the loop's ticks since the last one of these; none without a tick."""
         before, self._timing = self._timing, timing
         since = timing if before is None else timing.since(before)
-        shares = {what: since.of(what).summary_us() for what in COUNTED}
+        shares = {
+            what: {  # not a number where nothing was counted
+                name: np.nan if us is None else us
+                for name, us in zip(SHARE_FIELDS, since.of(what).summary_us().values(), strict=True)
+            }
+            for what in COUNTED
+        }
         total = timing.of("loop_us").count
         if not since.of("loop_us").count:
             return []
@@ -326,7 +332,7 @@ class RunMessages:
             "ticks": total,
             "missed_deadlines": timing.missed,
             "missed_own": timing.missed_own,
-            **{what: _shares(found) for what, found in shares.items()},
+            **shares,
         }
         return [Message(TIMING_TOPIC, TIMING, stamp_ns, fields)]
 
@@ -348,12 +354,6 @@ class RunMessages:
         ]
         fields = {"header": header(stamp_ns), "status": status}
         return Message(FINDINGS, DIAGNOSTICS, stamp_ns, fields)
-
-
-def _shares(found: Mapping[str, float | None]) -> dict[str, float]:
-    """Shares under names that a message may have; not-a-number where nothing was counted."""
-    values = (np.nan if x is None else x for x in found.values())
-    return dict(zip(SHARE_FIELDS, values, strict=True))
 
 
 def table_fields(labels: Sequence[str], table: Array) -> dict[str, Any]:

@@ -34,7 +34,6 @@ from drivers.interface import Driver, JointSample
 SHORTEST_RING_S = 1.0
 RECORDER_NICE, DISPLAY_NICE = 5, 10
 DISPLAY_STALL_S = 3.0
-VIEW_END_S = 4.0  # at the end, for browsers to hear of it
 
 
 @dataclass(frozen=True)
@@ -284,7 +283,7 @@ class Supervisor:
         if self.display is not None:
             self.display.finish(lambda: 0, stall_s=DISPLAY_STALL_S)
         if self.view is not None and self.view.held:
-            latest = time.monotonic() + VIEW_END_S
+            latest = time.monotonic() + 4.0  # at the end, for browsers to hear of it
             self.view.finish(lambda: 0, hurry=lambda: time.monotonic() > latest)
         return None if learner is None else learner.result
 

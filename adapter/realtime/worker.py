@@ -23,7 +23,6 @@ from drivers.interface import DriverError
 # One thread per worker: libraries that bring a pool of their own read this when they are loaded.
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
 START_TIMEOUT_S = 180.0  # a first start compiles
-STALL_S = 30.0  # a worker that does nothing for so long at the end is given up
 KILL_WAIT_S = 5.0
 POLL_S = 0.05
 IDLE_S = 1e-3  # a worker without work looks again after so long
@@ -146,7 +145,7 @@ class Worker:
     def finish(
         self,
         progress: Callable[[], int],
-        stall_s: float = STALL_S,
+        stall_s: float = 30.0,  # a worker that does nothing for so long at the end is given up
         hurry: Callable[[], bool] = lambda: False,
     ) -> None:
         """Wait for its result as long as `progress` changes; then end it.

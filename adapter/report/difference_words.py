@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from adapter.runs.compare import BODY, FRAME, GRAVITY, NOTHING, SIGNIFICANT, Change, ModelDifference
+from adapter.runs.terminal import json_ready
 
 MATRIX_HEADS = ("joint", "its frame in the one before", "the link behind it")
 EFFECT_HEADS = ("effect", "from A to B, joint by joint", "z", "N m")
 LEGEND = "z: standard deviations; N m, mm: what it alone does to torque and to the hand, rms"
-MOSTLY = 0.5  # share that data can show, below which it is told
 
 
 def difference_matrix(found: ModelDifference) -> list[tuple[str, ...]]:
@@ -99,16 +99,13 @@ def _change_words(change: Change) -> str:
         (a, b), centres = values["mass_kg"], values["com_m"]
         way = 1e3 * float(np.linalg.norm(centres[1] - centres[0]))
         sizes = [float(np.trace(tensor)) / 3.0 for tensor in values["inertia_kg_m2"]]
-        words = (
-            f"{a:.4g} -> {b:.4g} kg, centre moved by {way:.3g} mm, mean inertia "
-            f"{sizes[0]:.3g} -> {sizes[1]:.3g} kg m²"
-        )
+        words = f"{a:.4g} -> {b:.4g} kg, centre moved by {way:.3g} mm, mean inertia "
+        words += f"{sizes[0]:.3g} -> {sizes[1]:.3g} kg m²"
     else:
-        words = ", ".join(
-            f"{'' if key == GRAVITY else key + ' '}{_number(a)} -> {_number(b)} {change.units[key]}"
-            for key, (a, b) in values.items()
-        )
-    if change.shown >= MOSTLY:
+        named = {key: "" if key == GRAVITY else f"{key} " for key in values}
+        told = {key: " -> ".join(map(_number, pair)) for key, pair in values.items()}
+        words = ", ".join(f"{named[key]}{told[key]} {change.units[key]}" for key in values)
+    if change.shown >= 0.5:
         return words
     share = f"{100.0 * change.shown:.2g} % of it" if change.shown else "none of it"
     return f"{words} (data can show {share})"
@@ -123,25 +120,7 @@ def _number(value: Any) -> str:
 
 def difference_json(found: ModelDifference) -> dict[str, Any]:
     """Everything, ready for JSON."""
-    changes = [
-        {
-            **asdict(change),
-            "values": {
-                key: [None if x is None else np.asarray(x).tolist() for x in pair]
-                for key, pair in change.values.items()
-            },
-            "listed": _listed(change),
-        }
-        for change in found.changes
-    ]
-    return {
-        "models": list(found.names),
-        "changes": changes,
-        "joints": list(found.joints),
-        "torque_nm": found.torque_nm.tolist(),
-        "torque_size_nm": found.torque_size_nm.tolist(),
-        "hand": found.hand,
-        "hand_rms_m": found.hand_rms_m,
-        "hand_max_m": found.hand_max_m,
-        "summary": difference_summary(found),
-    }
+    changes = [{**asdict(change), "listed": _listed(change)} for change in found.changes]
+    told = {**asdict(found), "changes": changes, "summary": difference_summary(found)}
+    told["models"] = told.pop("names")
+    return dict(json_ready(told))

@@ -18,11 +18,10 @@ from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
 from adapter.report.words import with_doubt
 from adapter.runs.fleet.arm import DAY_S, TIME, FleetArm, OfLog
-from adapter.runs.fleet.course import Drift, StandsOut
+from adapter.runs.fleet.course import Drift
 from adapter.runs.fleet.fleet import Fleet
 
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
-FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 MOST_ROWS = 300  # of recordings on the page; of more those to say something of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
@@ -51,7 +50,7 @@ def _log_cells(log: OfLog) -> tuple[str, ...]:
         "" if log.load is None else _signed(*log.load),
         f"{log.rmse[worst]:.3f} ({worst + 1})",
         _less(log.worth),
-        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
+        " ".join(map(str, log.disagrees)) if len(log.disagrees) < 4 else "everywhere",
     )
 
 
@@ -85,15 +84,14 @@ def drift_words(drift: Drift) -> str:
 
 def standing_out_words(arm: FleetArm) -> Iterator[str]:
     """A sentence for each recording with parameters that the others do not have."""
-    names, by_log = called(arm), dict[int, list[StandsOut]]()
-    for one in arm.standing_out:
-        by_log.setdefault(one.number, []).append(one)
-    for number, several in sorted(by_log.items()):
-        told = [
-            f"{KNOWN[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
-            f"{KNOWN[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
-            for x in several
-        ]
+    names, by_log = called(arm), dict[int, list[str]]()
+    for x in arm.standing_out:
+        effect = KNOWN[x.effect]
+        by_log.setdefault(x.number, []).append(
+            f"{effect.title.lower()} of joint {x.joint} is {x.value:.3g} "
+            f"{effect.parameters[0].written} where {x.expected:.3g} was to be expected"
+        )
+    for number, told in sorted(by_log.items()):
         yield f"{names[number]} stands out: {'; '.join(told)}"
 
 
@@ -114,10 +112,8 @@ def sentences(arm: FleetArm) -> list[str]:
     used = [(x, name) for name, x in zip(names, arm.logs, strict=True) if x.used]
     if len(used) > 1:
         best, name = max(used, key=lambda one: one[0].worth)
-        found.append(
-            f"The motion of {name} would teach most if repeated: standard "
-            f"deviations would be {_less(best.worth)} less (geometric mean)"
-        )
+        less = f"deviations would be {_less(best.worth)} less (geometric mean)"
+        found.append(f"The motion of {name} would teach most if repeated: standard {less}")
     return found
 
 
@@ -217,10 +213,8 @@ def _parameters(arm: FleetArm) -> Table:
         mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
         values = [with_doubt(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
         rows.append([name, with_doubt(*mass), *values])
-    note = (
-        "A mass without a standard deviation is the documentation's: torques show it in sums only."
-    )
-    return Table(heads, rows, units, note)
+    note = "A mass without a standard deviation is the documentation's: torques show it in sums"
+    return Table(heads, rows, units, f"{note} only.")
 
 
 def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
@@ -233,10 +227,8 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
         drawing = Drawing("half")
         ax = drawing.axes[0]
         for j in range(used[0].effects.shape[1]):
-            y, std = (
-                np.array([getattr(log, key)[k, j] for log in used])
-                for key in ("effects", "effects_std")
-            )
+            y = np.array([log.effects[k, j] for log in used])
+            std = np.array([log.effects_std[k, j] for log in used])
             look = ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)
             look.set_label(str(j + 1))
         legend(ax, ncols=8, fontsize=6, loc="lower center", bbox_to_anchor=(0.5, 0.98))

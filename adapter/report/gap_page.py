@@ -20,14 +20,12 @@ from adapter.report.html import fill
 from adapter.report.next_steps import Step, command
 from adapter.report.tables import Tile
 from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
-from adapter.report.words import NARROW, capital
+from adapter.report.words import NARROW, arrow, capital
 
 WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
-OURS = (  # how clauses begin that are words of ours, no names
-    *("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints"),
-    *(WORTH, "but "),
-)
+# How clauses begin that are words of ours, no names.
+OURS = ("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints")
 
 
 def render_gap_page(result: GapResult, folder: Path | None = None) -> str:
@@ -44,8 +42,9 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     shown = _tiles(result) if told else []
     correction, ratio = tables.correction_table(result), tables.correction_ratio(result)
     found = "what was found" if result.findings else ""
-    corrected = "the small correction of the inertias" if correction else ""
+    added = filter(None, (found, "the small correction of the inertias" if correction else ""))
     largest = 0.0 if ratio is None or not ratio.size else float(np.abs(ratio).max())
+    part = f"The largest part is {largest:.1f} times the deviation that was"
     more = len(result.recordings) - MOST_NAMED
     took = f"{result.wall_s:.1f} s" if result.wall_s > 0.0 else DASH
     return {
@@ -62,8 +61,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "contradictions": [capital(text) for text in result.contradictions],
         "told": told,
         "error_table": tables.error_table(result) if told else None,
-        "after_words": "with "
-        + (" and ".join(filter(None, (found, corrected))) or "nothing added"),
+        "after_words": f"with {' and '.join(added) or 'nothing added'}",
         "errors": error_panels(result) if told else [],
         "signatures": signature_panels(result),
         "marked": any(f.interval_s[0] > 0.0 or not f.lasting for f in result.findings),
@@ -73,9 +71,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "unexplained_panels": unexplained_panels(result),
         "unseen": tables.unseen_table(result),
         "correction": correction if told else None,
-        "correction_words": ""
-        if ratio is None or not told
-        else f"The largest part is {largest:.1f} times the deviation that was expected beforehand.",
+        "correction_words": "" if ratio is None or not told else f"{part} expected beforehand.",
         "checks": gap_checks(result),
         "steps": gap_steps(result, folder),
         "notes": result.notes,
@@ -96,7 +92,7 @@ def _headline(result: GapResult) -> list[str]:
         parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
         return parts
-    said = [capital(text) if text.startswith(OURS) else text for text in parts]
+    said = [capital(text) if text.startswith((*OURS, WORTH, "but ")) else text for text in parts]
     return [f"{tables.tied(text.replace(' -> ', ' → '))}." for text in said]
 
 
@@ -121,35 +117,23 @@ def _tiles(result: GapResult) -> list[Tile]:
     worst = words.worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
-        fell = f"{words.fall(first, last)} {result.unit('N m', worst)}".replace("->", "→").replace(
-            " ", NARROW
-        )
+        fell = f"{words.fall(first, last)} {result.unit('N m', worst)}".replace("->", "→")
+        fell = fell.replace(" ", NARROW)
         tiles.append(Tile("Torque error", fell, f"joint {worst + 1}, the worst; rms"))
     if worst is not None and noise[worst] > 0.0:
         times = words.noise_times(result)
-        tiles.append(
-            Tile(
-                "In units of its noise",
-                _arrow(times[0][worst], times[1][worst], "×"),
-                tables.tied(
-                    f"joint {worst + 1}, noise {plain(noise[worst], 2)} {result.unit('N m', worst)}"
-                ),
-            )
-        )
+        fell = arrow(times[0][worst], times[1][worst], "×")
+        level = f"noise {plain(noise[worst], 2)} {result.unit('N m', worst)}"
+        said = tables.tied(f"joint {worst + 1}, {level}")
+        tiles.append(Tile("In units of its noise", fell, said))
     off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
     if off is not None and np.isfinite(off).any():
         j = int(np.nanargmax(off))
         still = np.nan if off_after is None else off_after[j]
-        value, note = (
-            _arrow(1e3 * off[j], 1e3 * still, result.unit("mrad", j)),
-            f"joint {j + 1}, rms within 0.5 s",
-        )
-        tiles.append(Tile("Forward simulation off by", value, tables.tied(note)))
+        value = arrow(1e3 * off[j], 1e3 * still, result.unit("mrad", j))
+        note = tables.tied(f"joint {j + 1}, rms within 0.5 s")
+        tiles.append(Tile("Forward simulation off by", value, note))
     return tiles
-
-
-def _arrow(before: float, after: float, unit: str) -> str:
-    return f"{plain(before, 2)} → {plain(after, 2)} {unit}".replace(" ", NARROW)
 
 
 # --- whether to trust what is named, and what to do next -----------------------------------------

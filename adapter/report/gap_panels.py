@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,11 +36,9 @@ if TYPE_CHECKING:
 
 
 MOST_JOINTS = 3  # with signatures
-MOST_DOTS = 500  # of one cloud; a panel shows no more
 BINS, FEWEST_IN_BIN = 24, 4
 WIDEST = 99.5  # percentile of |residual| that a panel still holds
 SHOWN_ROLLOUT_S = 10.0
-LEFT_OUT_S = 1.0  # between two points of a line: it breaks
 LEFT = 0.17  # of a small panel, where "−0.050" must fit
 SIGNATURES = (
     ("dq", "Against velocity", "velocity, rad/s"),
@@ -115,16 +112,6 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)
 
 
-@dataclass(frozen=True)
-class JointPanels:
-    """Panels of one joint: clouds of its residual, and its residual and motion over time."""
-
-    title: str
-    why: str
-    clouds: Sequence[Panel]
-    times: Sequence[Panel]
-
-
 def shown_joints(result: GapResult) -> list[int]:
     """Joints (from 0) whose signatures are worth a look, the worst ones first.
 
@@ -147,8 +134,11 @@ def shown_joints(result: GapResult) -> list[int]:
     return chosen[:MOST_JOINTS] or ranked[:1]
 
 
-def signature_panels(result: GapResult) -> list[JointPanels]:
-    """The residual of the joints worth a look, against what it may depend on."""
+def signature_panels(result: GapResult) -> list[dict[str, Any]]:
+    """The residual of the joints worth a look, against what it may depend on.
+
+    Of each the title, why it is shown, clouds of the residual, and panels over time.
+    """
     panels = []
     for j in shown_joints(result):
         clouds = []
@@ -160,17 +150,17 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
             laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
             for finding in laws:
                 _law(cloud.axes[0], finding)
-            clouds.append(
-                cloud.panel(title, result.unit("N m", j), ", ".join(f.title for f in laws))
-            )
-        times = [_over_time(result, j), _motion(result, j)]
+            called = ", ".join(f.title for f in laws)
+            clouds.append(cloud.panel(title, result.unit("N m", j), called))
         why = [result.joint_names[j]]
         said = [
             f.title for f in result.findings if j + 1 in f.joints or _worst(f.torque_rms_nm) == j
         ]
         said += ["something unexplained"] * any(x.joint == j + 1 for x in result.unexplained)
         why += [", ".join(dict.fromkeys(said))] if said else []
-        panels.append(JointPanels(f"Joint {j + 1}", "; ".join(why), clouds, times))
+        words = {"title": f"Joint {j + 1}", "why": "; ".join(why)}
+        times = [_over_time(result, j), _motion(result, j)]
+        panels.append({**words, "clouds": clouds, "times": times})
     return panels
 
 
@@ -237,7 +227,7 @@ def _dots(ax: Axes, x: Array, y: Array, color: str) -> None:
     keep = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not keep.size:
         return
-    keep = keep[np.unique(np.linspace(0, len(keep) - 1, MOST_DOTS).astype(int))]
+    keep = keep[np.unique(np.linspace(0, len(keep) - 1, 500).astype(int))]  # no more
     points = np.repeat(np.column_stack([x[keep], y[keep]]), 2, axis=0)
     path = Path(points, np.tile([Path.MOVETO, Path.LINETO], len(keep)))
     path.should_simplify = False
@@ -276,7 +266,7 @@ def _over_time(result: GapResult, j: int) -> Panel:
 def _line(t: Array, y: Array) -> tuple[Array, Array]:
     """A line over time, thinned, with a break where time is left out."""
     t, y = thin(t, y)
-    breaks = np.flatnonzero(np.diff(t) > LEFT_OUT_S) + 1
+    breaks = np.flatnonzero(np.diff(t) > 1.0) + 1  # s
     return np.insert(t, breaks, t[breaks]), np.insert(y, breaks, np.nan)
 
 
@@ -294,9 +284,8 @@ def _motion(result: GapResult, j: int) -> Panel:
     for left, color in ((curves.before, GOAL), (curves.after, ACCENT)):
         ax.plot(*_line(curves.t, tau - left[:, j]), color=color, linewidth=0.9)
     time_axis(drawing, "time, s")
-    return drawing.panel(
-        "Torque, measured and predicted", result.unit("N m", j), f"of {curves.recording}"
-    )
+    unit, note = result.unit("N m", j), f"of {curves.recording}"
+    return drawing.panel("Torque, measured and predicted", unit, note)
 
 
 def rollout_drawing(rollout: RolloutCurves, j: int, start: float, stop: float) -> Drawing:

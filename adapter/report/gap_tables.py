@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from adapter.gap import words
 from adapter.gap.phrases import parameter_lines, shown_unit, who
 from adapter.gap.result import Finding, GapResult, Unseen
-from adapter.gap.words import (
-    alike,
-    by_kind,
-    carried_words,
-    noise_times,
-    percent,
-    shares_of,
-    span,
-    title_of,
-)
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
-from adapter.report.tables import Table
+from adapter.report.tables import Table, by_column
 from adapter.report.words import NARROW, capital
 
 UNIT = re.compile(
@@ -37,45 +28,27 @@ def tied(text: str) -> str:
     return UNIT.sub(lambda found: NARROW + found[1].replace(" ", NARROW), text)
 
 
-@dataclass(frozen=True)
-class FindingRow:
-    """A finding as it stands in the table."""
-
-    what: str
-    where: str
-    when: str
-    values: list[str]
-    evidence: str
-    worth: str
-
-
-def finding_row(findings: Sequence[Finding]) -> FindingRow:
+def finding_row(findings: Sequence[Finding]) -> dict[str, Any]:
     """What, where, when, how much, how sure: one row for what is the same on several joints."""
     first = findings[0]
     ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
     joints = sorted({j for f in ordered for j in f.joints})
-    least = min(f.evidence for f in ordered)
-    sure = percent(least).replace("more than", ">")
-    alone = len(ordered) == 1
+    least, alone = min(f.evidence for f in ordered), len(ordered) == 1
+    sure = words.percent(least).replace("more than", ">")
     if first.recording and not alone:
         when = f"in {len({f.recording for f in ordered})} recordings"
     else:
-        when = span(first) or "throughout"
-    return FindingRow(
-        what=capital(first.title),
-        where=who(first.effect, joints),
-        when=when,
-        values=[f"{_ranges(ordered)}; joint by joint below"]
-        if in_matrix(ordered)
-        else [tied(line) for line in parameter_lines(first)]
-        if alone
-        else [
-            f"{f.recording or who(f.effect, f.joints)}: {', '.join(map(tied, parameter_lines(f)))}"
-            for f in ordered
-        ],
-        evidence=sure if alone or least >= 0.999 else f"{sure} and more",
-        worth=_worth(ordered),
-    )
+        when = words.span(first) or "throughout"
+    lines = [[tied(line) for line in parameter_lines(f)] for f in ordered]
+    values = lines[0] if alone else []
+    if in_matrix(ordered):
+        values = [f"{_ranges(ordered)}; joint by joint below"]
+    elif not alone:
+        owners = [f.recording or who(f.effect, f.joints) for f in ordered]
+        values = [f"{x}: {', '.join(own)}" for x, own in zip(owners, lines, strict=True)]
+    evidence = sure if alone or least >= 0.999 else f"{sure} and more"
+    row = {"what": capital(first.title), "where": who(first.effect, joints), "when": when}
+    return {**row, "values": values, "evidence": evidence, "worth": _worth(ordered)}
 
 
 def in_matrix(findings: Sequence[Finding]) -> bool:
@@ -93,9 +66,13 @@ def _ranges(findings: Sequence[Finding]) -> str:
     for key in findings[0].parameters:
         factor, unit = _unit(findings, key)
         values = [factor * float(f.parameters[key]) for f in findings]
-        low, high = plain(min(values), 2), plain(max(values), 2)
-        said.append(f"{key} = {low if low == high else f'{low} to {high}'} {unit}")
+        said.append(f"{key} = {_from_to(values)} {unit}")
     return tied(", ".join(said))
+
+
+def _from_to(values: Sequence[float]) -> str:
+    low, high = plain(min(values), 2), plain(max(values), 2)
+    return low if low == high else f"{low} to {high}"
 
 
 def _unit(findings: Sequence[Finding], key: str) -> tuple[float, str]:
@@ -107,53 +84,42 @@ def _unit(findings: Sequence[Finding], key: str) -> tuple[float, str]:
 def joint_matrix(result: GapResult) -> Table | None:
     """What several joints have, a row per joint and a column per parameter of an effect; None
     where no effect is of several."""
-    heads, units, columns = ["Joint"], [""], []
-    for findings in by_kind(result.findings):
-        if not in_matrix(findings):
-            continue
-        of = {f.joints[0]: f for f in findings}
-        for key in findings[0].parameters:
+    columns = [("Joint", "", list(result.joint_names))]
+    for findings in filter(in_matrix, words.by_kind(result.findings)):
+        first = findings[0]
+        for key in first.parameters:
             factor, unit = _unit(findings, key)
-            heads.append(capital(findings[0].title))
-            units.append(f"{key}, {unit}" + (f", {span(findings[0])}" if span(findings[0]) else ""))
-            std = {j: factor * np.asarray(f.std.get(key, np.nan), float) for j, f in of.items()}
-            columns.append(
-                {j: tied(plus_minus(factor * f.parameters[key], std[j])) for j, f in of.items()}
-            )
-    if not columns:
-        return None
-    rows = [
-        [name, *(column.get(j, DASH) for column in columns)]
-        for j, name in enumerate(result.joint_names, start=1)
-    ]
-    return Table(heads, rows, units)
+            cells = [DASH] * len(result.joint_names)
+            for f in findings:
+                std = factor * np.asarray(f.std.get(key, np.nan), float)
+                cells[f.joints[0] - 1] = tied(plus_minus(factor * f.parameters[key], std))
+            said = ", ".join(filter(None, (key, unit, words.span(first))))
+            columns.append((capital(first.title), said, cells))
+    return by_column(columns) if len(columns) > 1 else None
 
 
 def _worth(findings: Sequence[Finding]) -> str:
     sizes = [np.asarray(f.torque_rms_nm, dtype=float) for f in findings]
     most = [float(np.nanmax(x)) for x in sizes if np.isfinite(x).any()]
-    if not most:
-        return DASH
-    low, high = plain(min(most), 2), plain(max(most), 2)
-    return tied(f"{low} N m" if low == high else f"{low} to {high} N m")
+    return tied(f"{_from_to(most)} N m") if most else DASH
 
 
 def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
     """(findings, what else they could be and how much of them that explains, how to tell)."""
     rows = []
-    for findings in alike(result.findings):
-        shares = shares_of(findings)
+    for findings in words.alike(result.findings):
+        shares = words.shares_of(findings)
         if shares:
             joints = sorted(j for f in findings for j in f.joints)
             where = f"{capital(findings[0].title)}, {who(findings[0].effect, joints)}"
-            said = ", ".join(f"{title_of(name)} {share}" for name, share in shares)
+            said = ", ".join(f"{words.title_of(name)} {share}" for name, share in shares)
             rows.append((where, said, findings[0].split_by))
     return rows
 
 
 def carried_table(result: GapResult) -> Table | None:
     """What each of several recordings carries; None for one."""
-    rows = [[load.recording, *map(tied, carried_words(load))] for load in result.loads]
+    rows = [[load.recording, *map(tied, words.carried_words(load))] for load in result.loads]
     return Table(["Recording", "Load", "Where"], rows) if rows else None
 
 
@@ -169,7 +135,7 @@ def unseen_table(result: GapResult) -> Table | None:
         of = {x.joint: plain(factor * x.size, 2) for x in every}
         cells = [of.get(j, DASH) for j in range(len(heads) - 1)]
         way = "above" if every[0].above else "below"
-        body.append([f"{capital(title_of(effect))} {way}, {unit}", *cells])
+        body.append([f"{capital(words.title_of(effect))} {way}, {unit}", *cells])
     return Table(heads, body) if body else None
 
 
@@ -180,7 +146,7 @@ def error_table(result: GapResult) -> Table:
     own = result.unit("N m")
     units = ["", own, *[f"torque, {own}"] * 2, *["× noise"] * 2]
     noise = np.asarray(result.noise_floor_nm, dtype=float)
-    columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *noise_times(result)]
+    columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *words.noise_times(result)]
     for unit, key in (
         ("rollout, mrad", "rollout_rmse_rad"),
         ("rollout, mrad/s", "rollout_rmse_rad_s"),
@@ -206,15 +172,10 @@ def correction_table(result: GapResult) -> Table | None:
         link, part = np.unravel_index(place, ratio.shape)
         if ratio[link, part] == 0.0:
             break
-        rows.append(
-            [
-                f"link {link + 1}",
-                PARAMETERS[part],
-                tied(f"{result.corrections[link, part]:+.2g} {UNITS[part]}"),
-                f"± {plain(result.corrections_prior[link, part], 2)} {UNITS[part]}",
-                tied(f"{ratio[link, part]:+.1f}"),
-            ]
-        )
+        by = tied(f"{result.corrections[link, part]:+.2g} {UNITS[part]}")
+        prior = f"± {plain(result.corrections_prior[link, part], 2)} {UNITS[part]}"
+        times = tied(f"{ratio[link, part]:+.1f}")
+        rows.append([f"link {link + 1}", PARAMETERS[part], by, prior, times])
     heads = ["Link", "Parameter", "Correction", "Expected", "In units of it"]
     return Table(heads, rows) if rows else None
 

@@ -45,7 +45,6 @@ SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time t
 FIRST_S = 0.05  # left end of a logarithmic time axis
 LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
 SETTLED = "inside both goals"
-SHOWN_FIT_S = 20.0  # of the end of the run
 SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
 SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the panel
 FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
@@ -172,14 +171,10 @@ def body_panels(data: RunData) -> list[Panel]:
         for ax, (unit, parts) in zip(drawing.axes, GROUPS, strict=True):
             for k in parts:
                 alone = data.theta_shown[j, k] > SHARE_ALONE
-                ax.plot(
-                    t,
-                    theta[:, j, k],
-                    color=joint_color(COLOR_OF[k]),
-                    linewidth=1.3 if alone else 0.7,
-                    alpha=1.0 if alone else 0.6,
-                    gid=named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})"),
-                )
+                width, alpha = (1.3, 1.0) if alone else (0.7, 0.6)
+                name = named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})")
+                color = joint_color(COLOR_OF[k])
+                ax.plot(t, theta[:, j, k], color=color, linewidth=width, alpha=alpha, gid=name)
             ax.set_ylabel(unit, color=MUTED, fontsize=SIZES["quarter"][2], labelpad=1.0)
             ax.yaxis.set_major_locator(MaxNLocator(3))
         drawing.figure.subplots_adjust(left=0.21, hspace=0.1)
@@ -237,12 +232,9 @@ def error_panel(data: RunData) -> Panel:
         ax.set_ylim(0.0, max(SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()), 1.5 * usual))
     _finish(drawing, t, data)
     mark(ax, data.converged_s("theta"), f"inside {TORQUE_GOAL:g} × batch", top=0.88)
-    return drawing.panel(
-        "Prequential torque error",
-        "in units of the noise",
-        f"rms over {TORQUE_WINDOW_S:g} s and all joints; each sample is predicted first, "
-        "then learned from",
-    )
+    note = f"rms over {TORQUE_WINDOW_S:g} s and all joints; each sample is predicted first, then "
+    note += "learned from"
+    return drawing.panel("Prequential torque error", "in units of the noise", note)
 
 
 def error_by_joint(data: RunData) -> Panel:
@@ -263,9 +255,9 @@ def error_by_joint(data: RunData) -> Panel:
 
 
 def fit_window(data: RunData) -> Array:
-    """Which rows of the score (bool) the fit is shown for: after the last change, at the end."""
+    """Which rows of the score (bool) the fit is shown for: after the last change, the last 20 s."""
     t = data.times(data.score_trace)
-    start = max([t[-1] - SHOWN_FIT_S, *change_times(data)])
+    start = max([t[-1] - 20.0, *change_times(data)])
     return np.asarray(t >= start)
 
 

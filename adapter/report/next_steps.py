@@ -19,16 +19,12 @@ LEARNED_SHARE = 0.7  # of a recording that is learned from where the rest is hel
 LONGER = 2.0  # times the duration of a run that was too short
 SIMULATED = "pybullet"
 # Options that make a recording readable, which whoever reads it next needs, too
-HOW_READ = (
-    *("--topic", "--turn", "--zero", "--tau", "--tau-gain", "--gear", "--known-load", "--loaded"),
-    "--trust-log",
-)
+HOW_READ = ["--topic", "--turn", "--zero", "--tau", "--tau-gain", "--gear", "--known-load"]
+HOW_READ += ["--loaded", "--trust-log"]
 # Options of a run that the next one does not repeat
-ITS_OWN = (
-    *("--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"),
-    *("--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"),
-    *("--foxglove", "--fault", "--record", "--overwrite"),
-)
+ITS_OWN = ["--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"]
+ITS_OWN += ["--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"]
+ITS_OWN += ["--foxglove", "--fault", "--record", "--overwrite"]
 
 
 @dataclass(frozen=True)
@@ -105,11 +101,10 @@ def _longer(data: RunData, files: _Files) -> Step:
         span_s = LONGER * (_seconds(data) or 30.0)
         why = "The learner had not settled: run for longer, with a motion designed to teach most"
         words = [*_again(data), "--duration", f"{span_s:.0f}"]
-        more = _leave(data)
         if not data.figures.get("tracking"):  # somebody else moved the arm
             why = "The learner had not settled: listen for longer, to more motion of every joint"
             return Step(why, command(*words, "--passive"))
-        return Step(why, command(*words, "--excitation", "designed", *more))
+        return Step(why, command(*words, "--excitation", "designed", *_leave(data)))
     why = "The learner had not settled: see what this motion lacks"
     return files.read(why, "info", files.logs[:1], "--robot", files.documented)
 
@@ -157,11 +152,10 @@ def _feedforward(data: RunData, worth: Worth) -> Step | None:
         return None
     span_s = max(LONGER * (_seconds(data) or 30.0), 30.0)
     words = [*_again(data), "--feedforward", "learned", "--duration", f"{span_s:.0f}"]
-    words += _leave(data)
     why = "Let the learned model help the controller; the next report says what that is worth"
     if figures.get("feedforward") == "learned":
         why = "Run for longer, so that the learned model gets to help the controller"
-    return Step(why, command(*words))
+    return Step(why, command(*words, *_leave(data)))
 
 
 def _held_out(data: RunData, files: _Files) -> Step | None:

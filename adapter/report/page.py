@@ -47,6 +47,7 @@ def context(data: RunData) -> dict[str, Any]:
     figures, started, worth = data.figures, learned_panels.theta_started(data), Worth.of(data)
     fit = data.times(data.score_trace)[learned_panels.fit_window(data)] if started else []
     fault, start_s = figures.get("fault"), figures.get("start_s") or 0.0
+    names = data.documented.tree.joint_names
     errors = learned_panels.error_panel, learned_panels.error_by_joint
     ended = [f"The run ended early: {fault}"] if fault else []
     new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
@@ -62,9 +63,7 @@ def context(data: RunData) -> dict[str, Any]:
         "doubt": worth.torque is not None and worth.torque.after_std is not None,
         "checks": checks(data, worth),
         "steps": next_steps(data, worth),
-        "joints": [
-            (j % JOINT_COLORS + 1, name) for j, name in enumerate(data.documented.tree.joint_names)
-        ],
+        "joints": [(j % JOINT_COLORS + 1, name) for j, name in enumerate(names)],
         "schema": learned_panels.schema_panels(data),
         "skeleton": skeleton_panels(data),
         "has_reference": has_reference(data),
@@ -109,8 +108,7 @@ def _histogram_panels(figures: Mapping[str, Any]) -> list[Panel]:
             ax.set_yscale("symlog", linthresh=1.0)
             ax.set_ylim(0.0, 2.0 * counts.max())
         time_axis(drawing, "duration, µs")
-        name = tables.TIMES.get(key, key.removesuffix("_us").replace("_", " ").capitalize())
-        panels.append(drawing.panel(name, "ticks per bin"))
+        panels.append(drawing.panel(tables.named(key), "ticks per bin"))
     return panels
 
 
@@ -124,13 +122,8 @@ def _tracking_table(figures: Mapping[str, Any]) -> tables.Table | None:
             continue
         rms = 1e3 * np.array(values["rms_rad"], float)
         most = values.get("max_rad")
-        rows.append(
-            [
-                names.get(name, name.replace("_", " ")),
-                words.count(values.get("samples") or 0),
-                words.number(float(np.sqrt(np.mean(rms**2)))),
-                words.number(None if not most else 1e3 * max(most)),
-            ]
-        )
+        sizes = float(np.sqrt(np.mean(rms**2))), None if not most else 1e3 * max(most)
+        count = words.count(values.get("samples") or 0)
+        rows.append([names.get(name, name.replace("_", " ")), count, *map(words.number, sizes)])
     heads = ["Control", "Samples", "rms, all joints", "largest"]
     return tables.Table(heads, rows, ["", "", "mrad", "mrad"]) if rows else None

@@ -140,10 +140,8 @@ def _joint_panels(motion: PathMotion, limits: MotionLimits, names: Sequence[str]
     for j in range(len(names)):
         ends = [limits.lower[j], limits.upper[j]]
         ranges.axes[0].plot(ends, [j, j], color=GRID, linewidth=7.0, solid_capstyle="butt")
-        moved = [lower[j], upper[j]]
-        ranges.axes[0].plot(
-            moved, [j, j], color=joint_color(j), linewidth=4.0, solid_capstyle="butt"
-        )
+        ends, own = [lower[j], upper[j]], joint_color(j)
+        ranges.axes[0].plot(ends, [j, j], color=own, linewidth=4.0, solid_capstyle="butt")
     parts = speed / fastest, acceleration / limits.acceleration, jerk / limits.jerk
     for k, (part, color) in enumerate(zip(parts, (ACCENT, MUTED, INK), strict=True)):
         shares.axes[0].barh(at + 0.25 * (k - 1), 100.0 * part, 0.22, color=color)
@@ -151,7 +149,6 @@ def _joint_panels(motion: PathMotion, limits: MotionLimits, names: Sequence[str]
         drawing.axes[0].set_yticks(at, list(names), parse_math=False)
         drawing.axes[0].invert_yaxis()
         drawing.figure.subplots_adjust(left=0.24)
-    return [
-        ranges.panel("Ranges", "rad", "grey: the limits"),
-        shares.panel("Shares of the limits", "%", "blue speed, grey acceleration, black jerk"),
-    ]
+    said = "blue speed, grey acceleration, black jerk"
+    where = ranges.panel("Ranges", "rad", "grey: the limits")
+    return [where, shares.panel("Shares of the limits", "%", said)]

@@ -17,12 +17,11 @@ from adapter.report.gap_tables import tied
 from adapter.report.html import fill
 from adapter.report.next_steps import Step, command
 from adapter.report.style import Panel
-from adapter.report.tables import Table, Tile
+from adapter.report.tables import Table, Tile, by_column
 from adapter.report.trust import GOOD, LOOK, Check
-from adapter.report.words import NARROW, capital
+from adapter.report.words import arrow, capital
 
 SHARE, CLOSE_MRAD = 0.25, 4.0  # of the error before; or so small: the joint is explained
-MOST_SHOWN = 6  # joints whose worst moment is drawn
 TITLES = tuple(title for title, _, _ in EFFECTS.values())  # what the table has, not the headline
 SLOW_RAD_S, MOSTLY = 0.1, 0.5  # where more than that share of what is left is
 
@@ -76,52 +75,37 @@ def render_servo_page(
     )
 
 
-def _arrow(before: float, after: float, unit: str) -> str:
-    said = f"{plain(1e3 * before, 2)} → {plain(1e3 * after, 2)} {unit}"
-    return said.replace(" ", NARROW)
-
-
 def _tiles(gap: ServoGap) -> list[Tile]:
     j = int(np.argmax(gap.before))
-    numbers = sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay")
+    off = arrow(1e3 * gap.before[j], 1e3 * gap.after[j], "mrad")
+    at_hand = arrow(1e3 * gap.hand_before[-1], 1e3 * gap.hand_after[-1], "mm")
+    numbers = str(sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay"))
     late = [f for f in gap.findings if f.effect == "servo_delay"]
     told = f"commands act {1e3 * late[0].values[0]:.2f} ms late" if late else "no delay of commands"
-    return [
-        Tile("Numbers found", str(numbers), told),
-        Tile("Tracking error", _arrow(gap.before[j], gap.after[j], "mrad"), f"joint {j + 1}, rms"),
-        Tile("At the hand", _arrow(gap.hand_before[-1], gap.hand_after[-1], "mm"), gap.hand),
-    ]
+    tracking = Tile("Tracking error", off, f"joint {j + 1}, rms")
+    return [Tile("Numbers found", numbers, told), tracking, Tile("At the hand", at_hand, gap.hand)]
 
 
 def _found(gap: ServoGap) -> Table | None:
     """Findings, a row for each joint and a column for each effect."""
-    heads, units, columns = ["Joint"], [""], []
+    columns = [("Joint", "", [f"{j} {name}" for j, name in enumerate(gap.joint_names, start=1)])]
     for finding in gap.findings:
         title, _, unit = EFFECTS[finding.effect]
         factor, shown = shown_unit(finding.values[0], unit)
-        heads.append(capital(title))
-        units.append(shown)
-        cells = dict[int, str]()
+        cells = [DASH] * len(gap.joint_names)
         rows = zip(finding.values, finding.std, finding.documented, strict=True)
         for j, (value, std, documented) in zip(finding.joints, rows, strict=True):
             known = "" if documented is None else f", not {plain(factor * documented, 3)}"
-            cells[j] = tied(f"{plus_minus(factor * value, factor * std)}{known}")
-        columns.append(cells)
-    if not columns:
-        return None
-    table = [
-        [f"{j} {name}", *(column.get(j, DASH) for column in columns)]
-        for j, name in enumerate(gap.joint_names, start=1)
-    ]
-    return Table(heads, table, units)
+            cells[j - 1] = tied(f"{plus_minus(factor * value, factor * std)}{known}")
+        columns.append((capital(title), shown, cells))
+    return by_column(columns) if len(columns) > 1 else None
 
 
 def _errors(gap: ServoGap) -> Table:
     hand = gap.hand_before, gap.hand_after
-    rows = [
-        [name, *(plain(1e3 * float(x[j]), 3) for x in (gap.before, gap.after, *hand))]
-        for j, name in enumerate(gap.joint_names)
-    ]
+    off = 1e3 * np.stack([gap.before, gap.after, *(x[:-1] for x in hand)], axis=1)
+    cells = ((plain(x, 3) for x in row) for row in off.tolist())
+    rows = [[name, *row] for name, row in zip(gap.joint_names, cells, strict=True)]
     rows.append(["all", DASH, DASH, *(plain(1e3 * x[-1], 3) for x in hand)])
     heads = ["Joint", "Before", "After", "Before", "After"]
     return Table(heads, rows, ["", "mrad", "mrad", "hand, mm", "hand, mm"])
@@ -130,17 +114,15 @@ def _errors(gap: ServoGap) -> Table:
 def _arms(numbers: Sequence[ServoNumber]) -> Table | None:
     """A row for each number, a column for each arm; those that differ stand out."""
     arms = list(dict.fromkeys(arm for number in numbers for arm in number.values))
-    rows = [
-        [capital(x.title), *(tied(x.cell(arm)) + " ◄" * (arm in x.odd) for arm in arms)]
-        for x in numbers
-    ]
+    told = ((x, [tied(x.cell(arm)) + " ◄" * (arm in x.odd) for arm in arms]) for x in numbers)
+    rows = [[capital(x.title), *cells] for x, cells in told]
     return Table(["Number", *arms], rows) if rows else None
 
 
 def _moments(gap: ServoGap) -> list[Panel]:
     """The seconds in which the new servos are most off, of the joints that are most off."""
     panels = []
-    for j in np.argsort(-gap.after)[:MOST_SHOWN].tolist():
+    for j in np.argsort(-gap.after)[:6].tolist():
         each = []
         for name, x in gap.curves:
             start, stop = worst_window(x.t, left := x.after[:, j] - x.measured[:, j])
@@ -163,14 +145,11 @@ def _checks(gap: ServoGap) -> list[Check]:
     lost = f"; {who('', gap.worse)}: not better" if gap.worse else ""
     checks = [Check(LOOK if gap.worse else GOOD, "On data not fitted", said + lost)]
     left = [j + 1 for j in _unexplained(gap)]
+    said = f"every joint is below a quarter of its error or below {CLOSE_MRAD:g} mrad"
     if left:
         said = f"{who('', left)}: more than a quarter of the error and {CLOSE_MRAD:g} mrad"
-        checks.append(
-            Check(LOOK, "What is left", f"{said} that no number of these servos explains")
-        )
-    else:
-        said = f"every joint is below a quarter of its error or below {CLOSE_MRAD:g} mrad"
-        checks.append(Check(GOOD, "What is left", said))
+        said += " that no number of these servos explains"
+    checks.append(Check(LOOK if left else GOOD, "What is left", said))
     if gap.scale_open:
         said = (
             f"{who('', gap.scale_open)}: the documented masses hardly load it: motion is "
@@ -188,25 +167,23 @@ def _steps(gap: ServoGap, model: str, servos: Path) -> list[Step]:
         steps.append(Step(why, command("gap", *gap.recordings, "--hold-out", "ANOTHER")))
     if gap.ground.root > gap.servos.ground.root == 0.0:
         steps.append(Step("Record a second motion that touches the table, or none that does"))
-    slow, fast = list[int](), list[int]()
-    for j in _unexplained(gap):
-        (slow if _share_slow(gap, j) > MOSTLY else fast).append(j + 1)
-    if slow:
-        why = "what is left is where it is slow: record slow ramps up and down, with stops"
-        steps.append(Step(f"{capital(who('', slow))}: {why}"))
-    if fast:
-        why = "what is left is where it is fast: record steps and quick motions of several sizes"
-        steps.append(Step(f"{capital(who('', fast))}: {why}"))
-    if gap.scale_open:
-        why = "move it with a known mass in the hand that the model has too"
-        steps.append(Step(f"{capital(who('', gap.scale_open))}: {why}"))
+    left = _unexplained(gap)
+    slow = [j + 1 for j in left if _share_slow(gap, j) > MOSTLY]
+    fast = [j + 1 for j in left if j + 1 not in slow]
+    rest = "what is left is where it is"
+    for joints, why in (
+        (slow, f"{rest} slow: record slow ramps up and down, with stops"),
+        (fast, f"{rest} fast: record steps and quick motions of several sizes"),
+        (gap.scale_open, "move it with a known mass in the hand that the model has too"),
+    ):
+        if joints:
+            steps.append(Step(f"{capital(who('', joints))}: {why}"))
     if not gap.servos.is_ideal:
         why = "Use it: an arm for MuJoCo that follows commands as this one does"
-        words = "export", model, "--servo", str(servos), "--mjcf", "arm.xml"
-        steps.append(Step(why, command(*words)))
+        own = "--servo", str(servos)
+        steps.append(Step(why, command("export", model, *own, "--mjcf", "arm.xml")))
         why = "See later what wears: only what has changed is named"
-        words = "gap", "LATER.mcap", "--robot", model, "--servo", str(servos)
-        steps.append(Step(why, command(*words)))
+        steps.append(Step(why, command("gap", "LATER.mcap", "--robot", model, *own)))
     return steps
 
 

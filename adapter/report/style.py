@@ -85,13 +85,8 @@ class Drawing:
         self.figure = Figure(figsize=(width, height * stretch))
         FigureCanvasSVG(self.figure)
         with rc_context({"font.size": text, "axes.linewidth": 0.6}):
-            self.axes: list[Axes] = list(
-                np.ravel(
-                    self.figure.subplots(
-                        len(rows), 1, sharex=True, gridspec_kw={"height_ratios": rows}
-                    )
-                )
-            )
+            axes = self.figure.subplots(len(rows), 1, sharex=True, height_ratios=rows)
+            self.axes: list[Axes] = list(np.ravel(axes))
         left, foot = 3.4 * text / 72 / width, 3.1 * text / 72 / (height * stretch)
         if bare:
             self.figure.subplots_adjust(0.02, 0.02, 0.98, 0.98)
@@ -215,34 +210,23 @@ def mark(ax: Axes, x: float | None, text: str, top: float = 0.98) -> None:
         return
     ax.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
     share = ax.transAxes.inverted().transform(ax.transData.transform((x, ax.get_ylim()[1])))[0]
-    left = share > 0.7
-    ax.annotate(
-        text,
-        (x, top),
-        xycoords=("data", "axes fraction"),
-        xytext=(-3 if left else 3, 0),
-        textcoords="offset points",
-        ha="right" if left else "left",
-        va="top",
-        color=MUTED,
-        fontsize=SIZES["third"][2],
-    )
+    side, away = ("right", -3) if share > 0.7 else ("left", 3)
+    coords = ("data", "axes fraction")
+    _say(ax, text, (x, top), MUTED, xycoords=coords, xytext=(away, 0), ha=side, va="top")
 
 
 def level(ax: Axes, y: float, text: str, left: bool) -> None:
     """A horizontal goal line with its words at the left or the right end."""
     ax.axhline(y, color=GOAL, linewidth=0.9, linestyle=(0, (4, 2)))
-    ax.annotate(
-        text,
-        (0.0 if left else 1.0, y),
-        xycoords=("axes fraction", "data"),
-        xytext=(3 if left else -2, 2),
-        textcoords="offset points",
-        ha="left" if left else "right",
-        va="bottom",
-        color=GOAL,
-        fontsize=SIZES["third"][2],
-    )
+    x, side, away = (0.0, "left", 3) if left else (1.0, "right", -2)
+    coords = ("axes fraction", "data")
+    _say(ax, text, (x, y), GOAL, xycoords=coords, xytext=(away, 2), ha=side, va="bottom")
+
+
+def _say(ax: Axes, text: str, at: tuple[float, float], color: str, **how: Any) -> None:
+    """Words beside a place, as matplotlib's `annotate` has it."""
+    size = SIZES["third"][2]
+    ax.annotate(text, at, textcoords="offset points", color=color, fontsize=size, **how)
 
 
 def thin(t: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:

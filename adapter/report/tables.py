@@ -152,12 +152,9 @@ def schema_matrix(data: RunData) -> Matrix:
     """Which turns and shifts of the frames the run's motion showed."""
     std, names = data.model.lam_std, data.documented.tree.joint_names
     rank = data.figures["lambda"].get("identifiable_rank")
-    rows = [
-        (name, [_cell(shown[k], spread[k], LAMBDA_UNITS[k]) for k in range(6)])
-        for name, shown, spread in zip(names, data.lam_shown, std, strict=True)
-    ]
-    summary = f"{rank} of {6 * data.n} directions"
-    return Matrix("Body schema λ", summary, LAMBDA_NAMES, rows)
+    pairs = zip(names, data.lam_shown, std, strict=True)
+    rows = [(name, list(map(_cell, shown, own, LAMBDA_UNITS))) for name, shown, own in pairs]
+    return Matrix("Body schema λ", f"{rank} of {6 * data.n} directions", LAMBDA_NAMES, rows)
 
 
 def theta_matrix(data: RunData) -> Matrix:
@@ -165,11 +162,9 @@ def theta_matrix(data: RunData) -> Matrix:
     std, names = data.model.theta_std[-data.n :], data.documented.tree.link_names
     rank = data.figures["theta"].get("base_parameters")
     started = theta_started(data)
-    rows = []
-    for j, name in enumerate(names):
-        shares = data.theta_shown[j] if started else np.zeros(10)
-        cells = [_cell(shares[k], std[j, k], UNITS[k]) for k in range(10)]
-        rows.append((name, cells))
+    shares = data.theta_shown if started else np.zeros((len(names), 10))
+    pairs = zip(names, shares, std, strict=True)
+    rows = [(name, list(map(_cell, share, own, UNITS))) for name, share, own in pairs]
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
         summary = f"none of {10 * data.n} parameters: θ was not learned"
@@ -190,14 +185,16 @@ def timing_table(figures: Mapping[str, Any]) -> Table | None:
     timed = {key: timing.get(key) or figures.get(key) for key in (*TIMES, *timing, *figures)}
     rows = []
     for key, values in timed.items():
-        if not (key.endswith("_us") and isinstance(values, Mapping)):
-            continue
-        if any(values.get(name) is not None for name in PERCENTILES):
-            name = TIMES.get(key, key.removesuffix("_us").replace("_", " ").capitalize())
-            rows.append([name, *(number(values.get(share)) for share in PERCENTILES)])
-    if not rows:
-        return None
-    return Table(["", *PERCENTILES], rows, ["", *["µs"] * len(PERCENTILES)])
+        known = values if key.endswith("_us") and isinstance(values, Mapping) else {}
+        if any(known.get(name) is not None for name in PERCENTILES):
+            rows.append([named(key), *(number(known.get(share)) for share in PERCENTILES)])
+    units = ["", *["µs"] * len(PERCENTILES)]
+    return Table(["", *PERCENTILES], rows, units) if rows else None
+
+
+def named(key: str) -> str:
+    """What was timed under a key of the figures."""
+    return TIMES.get(key, key.removesuffix("_us").replace("_", " ").capitalize())
 
 
 def refused_table(figures: Mapping[str, Any]) -> Table | None:
@@ -205,10 +202,8 @@ def refused_table(figures: Mapping[str, Any]) -> Table | None:
     refused = {key: value for key, value in (figures.get("refused") or {}).items() if value}
     if not refused:
         return None
-    rows = [
-        [key.replace("_", " "), count(value), REFUSALS.get(key, "")]
-        for key, value in sorted(refused.items(), key=lambda item: -item[1])
-    ]
+    ordered = sorted(refused.items(), key=lambda item: -item[1])
+    rows = [[key.replace("_", " "), count(x), REFUSALS.get(key, "")] for key, x in ordered]
     return Table(["Reason", "Samples", "Meaning"], rows)
 
 
@@ -251,15 +246,13 @@ def schema_table(data: RunData) -> Table:
     rows = []
     for j, name in enumerate(data.documented.tree.joint_names):
         for what, lam in (("learned", data.model.lam), ("documented", data.documented.lam)):
-            rows.append(
-                [f"{name}, {what}", *(f"{round(x, 4) + 0.0:.4f}".replace("-", "−") for x in lam[j])]
-            )
+            told = [f"{round(x, 4) + 0.0:.4f}".replace("-", "−") for x in lam[j]]
+            rows.append([f"{name}, {what}", *told])
     note = (
         "R = Rz(α) Rx(β) Rz(γ). Angles of one frame may differ and mean the same frame; "
         "what motion does not show is taken from the documentation."
     )
-    units = ["", "rad", "rad", "rad", "m", "m", "m"]
-    return Table(["Joint", "α", "β", "γ", "p x", "p y", "p z"], rows, units, note)
+    return Table(["Joint", "α", "β", "γ", "p x", "p y", "p z"], rows, ["", *LAMBDA_UNITS], note)
 
 
 def provenance_rows(data: RunData) -> list[tuple[str, str, bool]]:

@@ -92,10 +92,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
         return [f"The learned model predicts torque to {after} ({fall.seen})."]
     before = _all_joints(fall.before, fall.before_std)
     if not (fall.better or fall.worse):
-        return [
-            f"The learned model predicts torque as the documentation does: to {after}, the "
-            f"documentation to {before} ({fall.seen})."
-        ]
+        both = f"to {after}, the documentation to {before} ({fall.seen})"
+        return [f"The learned model predicts torque as the documentation does: {both}."]
     more = np.square(fall.after) - np.square(fall.before)
     j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
     first, last = (quantity(x[j], "N m", 2) for x in (fall.before, fall.after))
@@ -158,17 +156,13 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
     if not (figures.get("torques") or {}).get("judged", True):
         said.append("Too little moved to tell whether the torques are this arm's.")
     if new:
-        said.append(
-            f"Something new acts that the learned model does not hold: {new} "
-            f"disagreement{'' if new == 1 else 's'}."
-        )
+        many = f"{new} disagreement{'' if new == 1 else 's'}"
+        said.append(f"Something new acts that the learned model does not hold: {many}.")
     return said
 
 
 GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
 LEFT = "Torque not explained"
-FEW_MISSED, MANY_MISSED = 1e-3, 1e-2  # shares of all deadlines
-FEW_REFUSED = 0.05  # share of all samples
 
 
 @dataclass(frozen=True)
@@ -230,9 +224,8 @@ def _left(data: RunData) -> Check | None:
     joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
     most = f"{'up to ' if len(which) > 1 else ''}{most}"
     why = "something acts that no learned effect explains"
-    return Check(
-        LOOK, LEFT, f"{said}; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}"
-    )
+    said += f"; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}"
+    return Check(LOOK, LEFT, said)
 
 
 def _parameters(data: RunData) -> Check | None:
@@ -242,10 +235,8 @@ def _parameters(data: RunData) -> Check | None:
         return Check(BAD, "Inertias and friction", said)
     rank, every = theta.get("base_parameters"), 10 * data.n
     alone = data.theta_shown > SHARE_ALONE
-    said = (
-        f"torques show {rank} combinations of {every} inertial parameters, "
-        f"{int(alone.sum())} of them on their own"
-    )
+    said = f"torques show {rank} combinations of {every} inertial parameters, "
+    said += f"{int(alone.sum())} of them on their own"
     at, goal = theta.get("converged_s"), f"{TORQUE_GOAL:g} × the error of batch least squares"
     if at is None:
         if not theta.get("settled", True):
@@ -334,8 +325,8 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
             f"{quantity(plant.get('p99'), 'µs')}, which waits where it is late: nothing is lost"
         )
     share = missed / deadlines
-    bad = share >= MANY_MISSED and not is_simulated(figures)
-    verdict = GOOD if share < FEW_MISSED else BAD if bad else LOOK
+    bad = share >= 1e-2 and not is_simulated(figures)
+    verdict = GOOD if share < 1e-3 else BAD if bad else LOOK
     return Check(verdict, "Timing", said)
 
 
@@ -350,5 +341,5 @@ def _samples(figures: Mapping[str, Any]) -> Check:
     gaps = len(figures.get("gaps") or [])
     if gaps:
         said += f"; {gaps} gap{'' if gaps == 1 else 's'} in the stamps"
-    bad = not learned or lost or learned < (1.0 - FEW_REFUSED) * samples
+    bad = not learned or lost or learned < 0.95 * samples
     return Check(LOOK if bad and learned else BAD if bad else GOOD, "Samples", said)

@@ -55,6 +55,11 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def arrow(before: float, after: float, unit: str) -> str:
+    """From a number to another, on one line."""
+    return f"{plain(before, 2)} → {plain(after, 2)} {unit}".replace(" ", NARROW)
+
+
 def count(value: int) -> str:
     """A whole number in groups of three."""
     return f"{int(value):,}".replace(",", NARROW)

@@ -32,7 +32,7 @@ from adapter.report.tables import (
     effect_columns,
     load_cells,
 )
-from adapter.report.words import capital, number, with_doubt
+from adapter.report.words import number, with_doubt
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import stamps_s
 from adapter.signals.validation import rms_of
@@ -151,13 +151,9 @@ def hand_off_m(data: RunData) -> float | None:
     """How far (rms over postures of the run, m) the outermost link stands from where the
     documentation puts it; None where no posture or no such link is known."""
     q = some_postures(data)
-    tips = [
-        [placed_arm(data, lam, row).tips for row in q]
-        for lam in (data.documented.lam, data.model.lam)
-    ]
-    apart = [
-        np.linalg.norm(there[j] - here[j]) for there, here in zip(*tips, strict=True) for j in there
-    ]
+    both = data.documented.lam, data.model.lam
+    tips = zip(*([placed_arm(data, lam, row).tips for row in q] for lam in both), strict=True)
+    apart = [np.linalg.norm(there[j] - here[j]) for there, here in tips for j in there]
     return float(np.sqrt(np.mean(np.square(apart)))) if apart else None
 
 
@@ -238,10 +234,8 @@ def _lacks(data: RunData, fall: Fall) -> list[Finding]:
 
 def _bodies(data: RunData, held: list[Mapping[str, Any]]) -> Array:
     """(n,) N m rms of what links change that weigh otherwise than documented, beside loads."""
-    loads = tuple(
-        {"effect": "payload", "parameters": {key: load[key] for key in ("m", "cx", "cy", "cz")}}
-        for load in held
-    )
+    told = [{key: load[key] for key in ("m", "cx", "cy", "cz")} for load in held]
+    loads = tuple({"effect": "payload", "parameters": parameters} for parameters in told)
     before = replace(data.documented, effects=(*data.documented.effects, *loads))
     after = replace(data.documented, theta=data.model.theta)
     return rms_of([_torque(data, after) - _torque(data, before)]).value
@@ -259,27 +253,20 @@ def truth_tables(data: RunData) -> list[Table]:
     lam, gravity = np.array(truth["lambda"]), np.array(truth["gravity"])
     arm = replace(data.documented, lam=lam, theta=theta, gravity=gravity, effects=tuple(entries))
     true = _torque(data, arm, own_log=True)
-    torque: list[tuple[str, str, list[str]]] = [
-        (f"{capital(name)} model off by", "N m rms", [number(x, 2) for x in rms_of([off]).value])
-        for name, off in (
-            ("documented", _torque(data, data.documented) - true),
-            ("learned", _torque(data, data.model) - true),
-        )
-    ]
+    torque: list[tuple[str, str, list[str]]] = []
+    for name, model in (("Documented", data.documented), ("Learned", data.model)):
+        off = rms_of([_torque(data, model) - true]).value
+        torque.append((f"{name} model off by", "N m rms", [number(x, 2) for x in off]))
     fitted = {(e["effect"], key) for e in data.model.effects for key in e.get("std") or ()}
-    told = effect_columns(active_effects(data.model.effects, n), data.model.tree, fitted)
-    columns = []
-    for (head, unit), cells in effect_columns(
-        active_effects(entries, n), data.model.tree, fitted
-    ).items():
-        columns += [(head, unit, told.get((head, unit), [DASH] * n)), ("in truth", unit, cells)]
+    learned = effect_columns(active_effects(data.model.effects, n), data.model.tree, fitted)
+    columns, true_of = [], effect_columns(active_effects(entries, n), data.model.tree, fitted)
+    for (head, unit), cells in true_of.items():
+        columns += [(head, unit, learned.get((head, unit), [DASH] * n)), ("in truth", unit, cells)]
     tables = [by_column([names, *torque]), *([by_column([names, *columns])] if columns else [])]
-    loads = [
-        ["in truth", *load_cells((e["interval_s"] or [0.0])[0] - data.start_s, e["parameters"])]
-        for e in entries
-        if e["effect"] == "payload"
-    ]
-    found = changes_table(data)
+    held = [x for x in entries if x["effect"] == "payload"]
+    at_s = [(x["interval_s"] or [0.0])[0] - data.start_s for x in held]
+    told = (load_cells(at, x["parameters"]) for at, x in zip(at_s, held, strict=True))
+    loads, found = [["in truth", *x] for x in told], changes_table(data)
     rows = [*(["learned", *row] for row in (found.rows if found else ())), *loads]
     return [*tables, *([Table(["", *CHANGE_HEADS], rows, ["", *CHANGE_UNITS])] if rows else [])]
 
@@ -293,10 +280,10 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
         if torque.size is not None:
             columns.append(("Torque that acted", "N m rms", [number(x) for x in torque.size]))
         if torque.before is not None:
-            shown = _values(torque.before, torque.before_std)
-            columns.append(("Error, documented model", "N m rms", shown))
-        shown = _values(torque.after, torque.after_std)
-        columns.append(("Error, learned model", "N m rms", shown))
+            before = _values(torque.before, torque.before_std)
+            columns.append(("Error, documented model", "N m rms", before))
+        after = _values(torque.after, torque.after_std)
+        columns.append(("Error, learned model", "N m rms", after))
         if torque.before is not None:
             shares = 100.0 * (torque.after / np.maximum(torque.before, 1e-12) - 1.0)
             changes = [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]

@@ -24,8 +24,6 @@ from adapter.model.spatial import Array
 from adapter.signals.records import KIND, LinkMotionKind, stamp_of, stamps_of
 from drivers.files.rows import RowsFile
 
-SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
-SCHEMA_POLISH = 300  # more of them, to the optimum
 # States taken at once where few steps are; more, and a change at the hand would be seen late. Of a
 # long recording it is one of so many parts, up to another number of states that are taken.
 SETTLED, PARTS, MOST_TAKEN = 100, 2000, 50
@@ -36,7 +34,6 @@ GAIN_STEPS, GAIN, FEW_STEPS = 40, 0.003, 4
 # (steps, share of the usual rate) at the end, at most so many times, to the optimum
 THETA_POLISH, POLISHES = ((250, 1.0), (250, 0.3)), 8
 PER_SAMPLE = 10  # states taken for each independent one
-LONGEST_NS = 10_000_000  # between two that are taken
 TRIPLES, APART = 2000, 8  # of neighbouring states, which tell the noise; at first so many apart
 
 
@@ -68,7 +65,7 @@ def learn_batch(
     waiting = _learn_schema(learner, tables, every)
     if learner.settings.wait_for_schema and not learner.schema.converged:
         return
-    learner.learn_schema(_NO_STATES, SCHEMA_POLISH)
+    learner.learn_schema(_NO_STATES, 300)  # more steps, to the optimum
     if not len(waiting.rows):
         return
     learner.start_theta(stamp_of(waiting.rows.rows(0, 1)[0]))
@@ -94,7 +91,7 @@ def thinning(learner: OnlineLearner, table: Array) -> int:
         return 1
     if not len(steps_ns):
         return 1
-    longest = LONGEST_NS // max(int(np.median(steps_ns)), 1)
+    longest = 10_000_000 // max(int(np.median(steps_ns)), 1)  # ns from one to the next
     return int(max(min(learner.theta.noise_gain // PER_SAMPLE, longest), 1))
 
 
@@ -120,7 +117,7 @@ def _learn_schema(learner: OnlineLearner, tables: Iterable[Array], every: int) -
         if not learner.schema.converged:
             waiting = len(kept)
     learner.take_every(1)
-    for _ in range(SCHEMA_STEPS):
+    for _ in range(2000):  # at most, until λ has converged
         if learner.schema.converged:
             break
         learner.learn_schema(_NO_STATES)

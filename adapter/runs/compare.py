@@ -153,16 +153,9 @@ def compare(first: SelfModel, second: SelfModel, seed: int = 0) -> ModelDifferen
     most_nm = max(float(size.max()), NOTHING)
     reach_m = max(float(np.linalg.norm(hand, axis=1).max()), NOTHING)
     changes.sort(key=lambda c: -(c.torque_nm / most_nm + c.hand_m / reach_m))
-    return ModelDifference(
-        (first.name, second.name),
-        joints,
-        tuple(changes),
-        rms,
-        size,
-        hand_frame(first).name,
-        float(np.sqrt(np.mean(apart**2))),
-        float(apart.max()),
-    )
+    away = hand_frame(first).name, float(np.sqrt(np.mean(apart**2))), float(apart.max())
+    names = first.name, second.name
+    return ModelDifference(names, joints, tuple(changes), rms, size, *away)
 
 
 def _variants(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
@@ -189,9 +182,8 @@ def _check_trees(first: SelfModel, second: SelfModel) -> None:
             told, way = what.replace("_", " "), ""
             if {*a.joint_names} < {*b.joint_names} or {*b.joint_names} < {*a.joint_names}:
                 way = "; --joints A,B,C compares these, --lock JOINT=VALUE takes one away"
-            both = " and ".join(
-                ", ".join(map(str, x)) if isinstance(x, tuple) else str(x) for x in (one, other)
-            )
+            listed = (x if isinstance(x, tuple) else (x,) for x in (one, other))
+            both = " and ".join(", ".join(map(str, x)) for x in listed)
             names = f"{first.name} and {second.name}"
             raise ModelError(f"{names} are different trees; {told}: {both}{way}")
     if a.floating:
@@ -293,11 +285,8 @@ def _effects(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
     for at in sorted(tables[0].keys() | tables[1].keys()):
         was, now = (table.get(at, []) for table in tables)
         before, after = ({k: v for a in found for k, v in a.values.items()} for found in (was, now))
-        values = {
-            key: (before.get(key), after.get(key))
-            for key in before | after
-            if not _same(before.get(key), after.get(key))
-        }
+        pairs = {key: (before.get(key), after.get(key)) for key in before | after}
+        values = {key: pair for key, pair in pairs.items() if not _same(*pair)}
         if not values:
             continue
         std = [{k: s for a in found for k, s in a.std.items()} for found in (was, now)]

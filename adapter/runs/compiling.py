@@ -21,8 +21,6 @@ from adapter.runs.replay import ReplayOptions, replay
 from drivers.files.mcap import Log
 from drivers.interface import JointSample
 
-COMPILE = "numba:compile"  # numba's event; none where a kernel comes from the cache
-SENTENCE = "compiling for this machine, once; this takes about half a minute"
 TRIED_S, SWING_RAD = 3.0, 0.2  # of the motion that every kernel is tried on
 
 Say = Callable[[str], None]
@@ -36,7 +34,7 @@ class _Announcer(event.Listener):
 
     def on_start(self, event: object) -> None:
         if not self.compiled:
-            self._say(SENTENCE)
+            self._say("compiling for this machine, once; this takes about half a minute")
         self.compiled += 1
 
     def on_end(self, event: object) -> None:
@@ -46,7 +44,7 @@ class _Announcer(event.Listener):
 def announce_compiling(say: Say) -> _Announcer:
     """From now on, say once when a kernel has to be compiled."""
     announcer = _Announcer(say)
-    event.register(COMPILE, announcer)
+    event.register("numba:compile", announcer)  # none where a kernel comes from the cache
     return announcer
 
 

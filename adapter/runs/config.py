@@ -127,11 +127,8 @@ def _known(kind: Any, table: Any, unknown: list[str], before: str = "") -> Any:
         return table
     hints = get_type_hints(kind)
     unknown += [before + key for key in table if key not in hints]
-    return {
-        key: _known(hints[key], part, unknown, f"{before}{key}.")
-        for key, part in table.items()
-        if key in hints
-    }
+    known = [key for key in table if key in hints]
+    return {key: _known(hints[key], table[key], unknown, f"{before}{key}.") for key in known}
 
 
 def config_table(config: Config) -> dict[str, Any]:

@@ -22,13 +22,11 @@ from adapter.physics.kernels import Frames, JointMotion, base_at_rest, regressor
 
 ADOPT_EVERY = 100  # samples
 
-RISE = 8  # samples at the beginning, in which the observer still follows
 LEAST = 10  # samples that a name takes
 ALIKE = 3.0  # samples that are one by their noise
 PUSH = np.array([20.0, 20.0, 20.0, 5.0, 5.0, 5.0])  # std of N and N m
 LOAD = np.array([2.0, 0.2, 0.2, 0.2])  # std of kg and kg m
 FRICTION_SHARE = 0.05  # std of a joint's friction, of its effort limit
-PROBABLE = 0.9
 CRUDE = 0.2  # of the torques, by which a way may be off: a load's inertia, a push that swells
 SLOW = 0.02  # rad/s; slower, friction has no direction
 
@@ -50,7 +48,7 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
         contact: as the observer keeps it.
         frames: of the arm; gravity: (3,) m/s²; effort: (n,) limits, N m.
     """
-    seen = contact.seen[RISE:]
+    seen = contact.seen[8:]  # at the beginning the observer still follows
     if len(seen) < LEAST:
         return Kind.OPEN
     since_s, q, dq, torque, std = np.array(seen).transpose(1, 0, 2).copy()
@@ -68,7 +66,7 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
     odds = np.exp(np.array(evidence) - max(evidence))
     for name in Kind:
         share = sum(own for own, other in zip(odds, names, strict=True) if other == name)
-        if share > PROBABLE * odds.sum():
+        if share > 0.9 * odds.sum():
             return name
     return Kind.OPEN
 

@@ -45,9 +45,7 @@ EXPORTED = (".urdf", ".xml", ".json")
 
 
 def load_model(
-    name: str | Path,
-    joints: Sequence[str] | None = None,
-    lock: Mapping[str, float] | None = None,
+    name: str | Path, joints: Sequence[str] | None = None, lock: Mapping[str, float] | None = None
 ) -> SelfModel:
     """The model of an arm: S = {N, A, λ, θ} (paper, eq. 1), with limits, effects and gravity.
 

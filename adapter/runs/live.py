@@ -116,9 +116,8 @@ def single_thread_learner(
     learner = make_learner(documented, settings)
     delay_s = make_front_end(documented, settings).delay_s
     tool = None if documented.tool is None else documented.tool.theta()
-    found, doubt = (
-        partial(tell, label) if aloud else keep_quiet for label in (DISAGREEMENT, "warning")
-    )
+    labels = (DISAGREEMENT, "warning")
+    found, doubt = (partial(tell, label) if aloud else keep_quiet for label in labels)
     learner.watch = Monitor(documented.tree.n, tool, delay_s, found)
     learner.screen = LiveScreen(documented, doubt, trusted)
     if resume is not None:
@@ -224,10 +223,8 @@ class Publisher:
     @staticmethod
     def _deviations(learner: OnlineLearner) -> tuple[Any, Any, Any]:
         n, schema, theta = learner.tree.n, learner.schema, learner.theta
-        variance, shown = (
-            np.einsum("jaa->ja", in_parents(schema.R0, x))
-            for x in (schema.covariance(), schema.identifiable)
-        )
+        tables = schema.covariance(), schema.identifiable
+        variance, shown = (np.einsum("jaa->ja", in_parents(schema.R0, x)) for x in tables)
         lam_std = np.where(shown > SHOWN_SHARE, np.sqrt(np.maximum(variance, 0.0)), np.nan)
         std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
         bodies = std[: 10 * (n + 1)].reshape(-1, 10)
@@ -252,5 +249,4 @@ def news_of(learner: OnlineLearner) -> dict[str, Any]:
     }
     while len(json_text(news).encode()) > NEWS_BYTES and findings:
         del findings[0]
-    plain: dict[str, Any] = json_ready(news)
-    return plain
+    return dict(json_ready(news))

@@ -26,10 +26,7 @@ from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfMod
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
-from adapter.physics.identifiability import (
-    BaseParameters,
-    random_regressor,
-)
+from adapter.physics.identifiability import BaseParameters, random_regressor
 from adapter.signals.records import LinkMotionKind
 
 TORQUE_GOAL = 1.1  # times the final batch least squares
@@ -307,15 +304,9 @@ def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
         for j in range(n):
             value, shape = float(outcome.effects[k, j]), float(outcome.shapes[k, j])
             name, parameters = effect.learned_as(value, shape)
-            entries.append(
-                {
-                    "effect": name,
-                    "joints": [j + 1],
-                    "parameters": parameters,
-                    "std": {effect.key: float(outcome.effects_std[k, j])},
-                    "units": KNOWN[name].units(tree.slides[j]),
-                }
-            )
+            entry = {"effect": name, "joints": [j + 1], "parameters": parameters}
+            entry["std"] = {effect.key: float(outcome.effects_std[k, j])}
+            entries.append({**entry, "units": KNOWN[name].units(tree.slides[j])})
     return entries
 
 

@@ -30,7 +30,6 @@ from adapter.signals.validation import Rms, errors_of_pieces, rms_of, validation
 from drivers.files.mcap import Log, mapped
 from drivers.interface import DriverError
 
-FEWEST_FOR_NOISE = 50  # samples
 # States that pass the front end in one table: as much as a processor's cache holds. Of the exact
 # mode whole times `ADOPT_EVERY`.
 AT_ONCE = 2000
@@ -85,11 +84,9 @@ def one_after_other(logs: Sequence[Log]) -> Log:
     warnings = [text for log in logs for text in log.warnings]
     if not any(log.is_mapped for log in logs):
         return replace(_joined(logs, later_ns), warnings=warnings)
-    pieces = (
-        replace(piece, stamp_ns=piece.stamp_ns + later)
-        for log, later in zip(logs, later_ns, strict=True)
-        for piece in log.pieces()
-    )
+    pairs = zip(logs, later_ns, strict=True)
+    own = ((piece, later) for log, later in pairs for piece in log.pieces())
+    pieces = (replace(piece, stamp_ns=piece.stamp_ns + later) for piece, later in own)
     return replace(mapped(logs[0], pieces), warnings=warnings)
 
 
@@ -259,12 +256,10 @@ def noise_levels(log: Log) -> dict[str, Array]:
 def _noise_levels(log: Log) -> dict[str, Array]:
     new = np.ones(len(log), dtype=bool)
     new[1:] = (np.diff(log.dq, axis=0) != 0).any(axis=1)
-    if new.sum() < FEWEST_FOR_NOISE:
-        return {name: np.full(log.dq.shape[1], np.nan) for name in ("q", "dq", "tau")}
-    return {
-        name: noise_from_samples(np.nan_to_num(getattr(log, name)[new]))
-        for name in ("q", "dq", "tau")
-    }
+    signals = {"q": log.q, "dq": log.dq, "tau": log.tau}
+    if new.sum() < 50:  # samples
+        return {name: np.full(log.dq.shape[1], np.nan) for name in signals}
+    return {name: noise_from_samples(np.nan_to_num(x[new])) for name, x in signals.items()}
 
 
 def held_out_rms(log: Log, model: SelfModel, settings: PipelineSettings) -> Rms:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +27,6 @@ MODEL, DOCUMENTED = "model.json", "documented.json"
 FIGURES, TRACES = "figures.json", "traces.npz"
 FILES = (MODEL, DOCUMENTED, FIGURES, TRACES)
 NEEDED_FIGURES = ("samples", "learned", "refused", "lambda", "theta")
-TRACE_ARRAYS = (
-    "start_lam",
-    "schema_trace",
-    "schema_errors",
-    "theta_trace",
-    "score_trace",
-    "fit",
-    "batch",
-    "noise",
-    "lam_shown",
-    "theta_shown",
-)
 
 
 class RunFolderError(ModelError):
@@ -145,11 +133,11 @@ class RunData:
 
     def score_signals(self) -> tuple[Array, Array, Array, Array, Array]:
         """q, dq, ddq, tau and prequential torque error, (k, n) each."""
-        n = self.n
-        q, dq, ddq, tau, error = (
-            self.score_trace[:, 1 + k * n : 1 + (k + 1) * n] for k in range(5)
-        )
+        q, dq, ddq, tau, error = np.split(self.score_trace[:, 1:], 5, axis=1)
         return q, dq, ddq, tau, error
+
+
+TRACE_ARRAYS = tuple(x.name for x in fields(RunData) if x.type == "Array")
 
 
 def run_data(

@@ -91,6 +91,16 @@ def labelled(label: str, style: str, line: str) -> None:
     _consoles()["console"].print(Text.assemble((label, style), " ", line), soft_wrap=True)
 
 
+def print_table(heads: Iterable[Any], rows: Iterable[Iterable[Any]], **how: Any) -> None:
+    """Print a table without lines; its heads are names or columns of rich's."""
+    from rich.table import Table
+
+    table = Table(*heads, box=None, pad_edge=False, **how)
+    for row in rows:
+        table.add_row(*row)
+    _consoles()["output"].print(table)
+
+
 def program_version() -> str:
     """Version of the installed distribution."""
     from importlib.metadata import PackageNotFoundError, version

@@ -151,10 +151,8 @@ class Readings:
     def _off(self, tau: Array, joints: Sequence[int]) -> str:
         before, after = (rms((x - self.model)[:, joints]) for x in (self.rows.tau, tau))
         there = " there" if len(joints) < len(self.names) else ""
-        return (
-            f"the model is off by {before:.3g} N m{there} as recorded and by {after:.3g} N m "
-            "so understood"
-        )
+        so = f"as recorded and by {after:.3g} N m so understood"
+        return f"the model is off by {before:.3g} N m{there} {so}"
 
     def _signs(self) -> Iterator[Reading]:
         alive = np.flatnonzero(self.telling.alive).tolist()
@@ -183,9 +181,8 @@ class Readings:
             if not moved:
                 continue
             tau = self.rows.tau[:, order]
-            pairs = ", ".join(
-                f"{self.names[int(order[j])]} holds that of {self.names[j]}" for j in moved
-            )
+            own = [(self.names[int(order[j])], self.names[j]) for j in moved]
+            pairs = ", ".join(f"{name} holds that of {whose}" for name, whose in own)
             said = (
                 "the torques are in another order than the positions, the column of "
                 f"{pairs}: {self._off(tau, moved)}; record them in the order of the joint names"

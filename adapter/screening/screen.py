@@ -12,26 +12,19 @@ from numpy.typing import NDArray
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.screening.likelihood import (
-    EVIDENCE,
-    ROWS,
-    Rows,
-    Telling,
-    explains_nothing,
-    lateness_s,
-)
+from adapter.screening.likelihood import EVIDENCE, ROWS, Rows, Telling, explains_nothing, lateness_s
 from adapter.screening.readings import angle, other_hand, otherwise_told
 from adapter.screening.rows import pauses, stuck
 from adapter.screening.timing import (
     RecordingClock,
     check_timing,
     put_forward,
+    source_stamps,
     uniform,
     unsaid,
     unwrapped,
 )
 from adapter.signals.matching import matching, most_moved, several
-from adapter.signals.source_clock import source_stamps
 from adapter.signals.told import told_of
 from adapter.signals.validation import GRID_S, smooth
 from drivers.files.mcap import Log
@@ -260,9 +253,8 @@ def of_this_robot(log: Log, model: SelfModel) -> Log:
         if arms := several(model.tree.joint_names, log):
             raise RecordingRefused(RecordingFault.ROBOT, arms) from None
         missing = [name for name in model.tree.joint_names if name not in log.joint_names]
-        raise _another_robot(
-            log, model, log.joint_names, f"it lacks {', '.join(missing)}"
-        ) from None
+        why = f"it lacks {', '.join(missing)}"
+        raise _another_robot(log, model, log.joint_names, why) from None
 
 
 def _another_robot(
@@ -364,19 +356,11 @@ def standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -
     still = [name for j, name in enumerate(names) if j not in moving]
     wide, fast = _extent(q, dq)
     little = [names[j] for j in moving if wide[j] < WANTED_RAD or fast[j] < WANTED_DQ]
-    notes = []
-    if still:
-        notes.append(
-            f"{', '.join(still)} stand still: nothing can be told of their friction, inertia, "
-            f"elasticity or encoders; move them by at least {WANTED_RAD} rad with at least "
-            f"{WANTED_DQ} rad/s."
-        )
-    if little:
-        notes.append(
-            f"{', '.join(little)} move little: what is told of them is uncertain; move them by "
-            f"at least {WANTED_RAD} rad with at least {WANTED_DQ} rad/s."
-        )
-    return notes
+    unknown = "nothing can be told of their friction, inertia, elasticity or encoders"
+    told = [(still, f"stand still: {unknown}")]
+    told.append((little, "move little: what is told of them is uncertain"))
+    mend = f"move them by at least {WANTED_RAD} rad with at least {WANTED_DQ} rad/s."
+    return [f"{', '.join(joints)} {said}; {mend}" for joints, said in told if joints]
 
 
 def silent(log: Log, names: Sequence[str]) -> list[str]:
@@ -392,10 +376,8 @@ def silent(log: Log, names: Sequence[str]) -> list[str]:
     t = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
     for name, rows in zip(names, stuck(t, log.dq, log.tau).T, strict=True):
         if rows.any() and name not in dead:
-            said.append(
-                f"The torque of {name} stays the same for {np.diff(t)[rows[1:]].sum():.2g} s in "
-                f"motion, from {t[rows][0]:.2f} s on."
-            )
+            span = f"{np.diff(t)[rows[1:]].sum():.2g} s in motion, from {t[rows][0]:.2f} s on"
+            said.append(f"The torque of {name} stays the same for {span}.")
     return said
 
 
@@ -459,10 +441,8 @@ def _judged(
         )
     if found:
         said = "; ".join(reading.said for reading in found)
-        raise RecordingRefused(
-            RecordingFault(found[0].kind),
-            f"{log.path}: {said}; the model explains the torques then and not as recorded.",
-        )
+        said = f"{log.path}: {said}; the model explains the torques then and not as recorded."
+        raise RecordingRefused(RecordingFault(found[0].kind), said)
     passed = Judged(late_s, partial(telling.corrected, now.x))
     if model.gravity.any():
         askew, gravity = telling.askew(rows)
@@ -472,10 +452,7 @@ def _judged(
 
 
 def judged_rows(
-    log: Log,
-    model: SelfModel,
-    smoothed: Sequence[Array],
-    unit_known: bool = False,
+    log: Log, model: SelfModel, smoothed: Sequence[Array], unit_known: bool = False
 ) -> tuple[Rows, Telling]:
     """The instants of a recording that are judged, and by what; see `judged`."""
     q, dq, ddq, tau = (x[EDGE:-EDGE] for x in smoothed)

@@ -22,6 +22,11 @@ FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
 TIMING_SHARE = 0.25  # of a sample period: a hold of half a sample, two of these, is no effect
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
 
+FEWEST_SLIPS = 3  # of a source that is slower all along
+SLIP_PERIODS = 0.5  # less motion than the stamps say, in median periods, is a state shown twice
+BETTER = 0.5  # times the disagreement of dq and the steps of q that the stamps leave
+FASTEST = 0.05  # share of the fastest step's speed below which a step's time is not told by motion
+
 Index = NDArray[np.int64]
 
 
@@ -75,9 +80,6 @@ class RecordingClock:
 
     def words(self) -> list[str]:
         """What is worth knowing, a sentence each; a recording without fault has none."""
-        return [*self._words_on_stamps(), *self._words_on_rows(), *self._words_on_signals()]
-
-    def _words_on_stamps(self) -> list[str]:
         said = []
         if self.out_of_order:
             said.append(f"{self.out_of_order} stamps do not increase; those samples are left out.")
@@ -89,14 +91,8 @@ class RecordingClock:
                 f"longest is {1e3 * length:.3g} ms at {start:.2f} s."
             )
         if self.jitter_s > 0.1 * self.period_s:
-            said.append(
-                f"The steps between stamps scatter by {1e3 * self.jitter_s:.2g} ms around "
-                f"{1e3 * self.period_s:.3g} ms."
-            )
-        return said
-
-    def _words_on_rows(self) -> list[str]:
-        said = []
+            around = f"{1e3 * self.jitter_s:.2g} ms around {1e3 * self.period_s:.3g} ms"
+            said.append(f"The steps between stamps scatter by {around}.")
         if self.not_finite:
             said.append(f"{self.not_finite} samples hold no number; they are left out.")
         if self.impossible:
@@ -105,17 +101,15 @@ class RecordingClock:
                 "zero, single readings far from those before and after); they are left out."
             )
         if self.repeated > 0.001:
-            said.append(
-                f"{100 * self.repeated:.1f} % of the samples repeat the one before; they are "
-                "left out."
-            )
+            share = f"{100 * self.repeated:.1f} %"
+            said.append(f"{share} of the samples repeat the one before; they are left out.")
         if self.frozen:
             start, length = max(self.frozen, key=lambda run: run[1])
             said.append(
                 f"The signals stand still while the arm moves, {len(self.frozen)} times, longest "
                 f"for {1e3 * length:.3g} ms at {start:.2f} s."
             )
-        return said
+        return [*said, *self._words_on_signals()]
 
     def _words_on_signals(self) -> list[str]:
         said = []
@@ -142,9 +136,8 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
         begins_s: when each piece begins, since the recording began.
     """
     samples = np.array([c.samples for c in clocks], dtype=float)
-    late, std = (
-        np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s")
-    )
+    own = ("lateness_s", "lateness_std_s")
+    late, std = (np.array([getattr(c, key) for c in clocks]) for key in own)
     told = np.isfinite(late) & np.isfinite(std)
     weight = np.maximum(std[told], 1e-6) ** -2.0  # of a lateness; no clock is better
     gains = np.array([c.velocity_gain for c in clocks])
@@ -422,3 +415,40 @@ def _solve(xx: Array, xy: Array) -> Array:
     """Coefficients (n, 3) of normal equations (n, 3, 3), (n, 3); a trace of ridge for rest."""
     ridge = 1e-9 * np.trace(xx, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-15 * np.eye(3)
     return np.asarray(np.linalg.solve(xx + ridge, xy[..., None])[..., 0])
+
+
+def source_stamps(stamp_ns: Index, q: Array, dq: Array) -> Index:
+    """Stamps (m,) ns of the states of a slower source that a faster, regular publisher shows.
+
+    A publisher at 30 Hz that shows the newest state of a source at 29.4 Hz stamps states that are
+    up to a period old, and every so often shows one twice. Its stamps are even, and the motion
+    between them is not: after a repeat the arm went as far in two periods as in one. The states
+    themselves are even, so they are numbered and spread over the time of the stamps. A repeat that
+    stands for a lost packet looks the same until the motion is asked: there the arm went on. Where
+    the motion agrees with the given stamps, these are returned.
+
+    Args:
+        stamp_ns: (m,) ns, strictly increasing, of samples of which none repeats the last.
+        q, dq: (m, n) rad, rad/s.
+    """
+    steps_s = 1e-9 * np.diff(stamp_ns)
+    if len(steps_s) < FEWEST_SLIPS:
+        return stamp_ns
+    period_s = float(np.median(steps_s))
+    went, speed = np.diff(q, axis=0), 0.5 * (dq[1:] + dq[:-1])
+    size = np.sum(speed**2, axis=1)
+    told = size > FASTEST**2 * size.max()
+    took_s = np.sum(went * speed, axis=1)[told] / size[told]
+    slips = np.flatnonzero(told)[took_s < steps_s[told] - SLIP_PERIODS * period_s]
+    # what moves too little to be told from slips between is as the stamps say
+    slips = slips[steps_s[slips] > (1.0 + SLIP_PERIODS) * period_s]
+    if len(slips) < FEWEST_SLIPS:
+        return stamp_ns
+    ticks = np.maximum(np.round(steps_s / period_s), 1.0)
+    ticks[slips] = np.maximum(ticks[slips] - 1.0, 1.0)
+    numbers = np.concatenate([[0.0], np.cumsum(ticks)])
+    span_ns = float(stamp_ns[-1] - stamp_ns[0])
+    even = stamp_ns[0] + np.round(numbers * (span_ns / numbers[-1])).astype(np.int64)
+    apart = (went - 1e-9 * np.diff(x)[:, None] * speed for x in (stamp_ns, even))
+    before, after = (float(np.sum(x**2)) for x in apart)
+    return even if after < BETTER * before else stamp_ns

@@ -45,10 +45,8 @@ def frames_on_base(robot: SelfModel, link: str) -> dict[str, Place]:
     places |= {f.name: (f.rotation, f.position) for f in robot.frames if f.parent == base}
     if link not in places:
         moves = " moves on it" if link in robot.tree.link_names else " is not there"
-        raise ModelError(
-            f"{robot.name}: a base that floats is the root link or one fixed to it; '{link}'"
-            f"{moves}; {choices(link, places)}"
-        )
+        said = "a base that floats is the root link or one fixed to it"
+        raise ModelError(f"{robot.name}: {said}; '{link}'{moves}; {choices(link, places)}")
     return {link: places[link], **places}
 
 
@@ -94,10 +92,8 @@ def with_base_motion(log: Log, robot: SelfModel, link: str) -> Log:
     used = dict.fromkeys(f"{m.topic} ({m.frame})" for m in (w_of, a_of, v_of) if m is not None)
     silent = int((~np.isfinite(base).all(axis=1)).sum())
     if silent == len(log):
-        raise DriverError(
-            f"{log.path}: {', '.join(used)} tell nothing at the joint samples' stamps; do they "
-            "share a clock?"
-        )
+        why = "tell nothing at the joint samples' stamps; do they share a clock?"
+        raise DriverError(f"{log.path}: {', '.join(used)} {why}")
     said = [f"{log.path}: motion of the base from {', '.join(used)}"]
     if silent:
         said.append(f"{log.path}: no motion of the base at {silent} of {len(log)} joint samples")

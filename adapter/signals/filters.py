@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.errors import SettingsError
+from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.settings import FilterSettings
-
-Array = NDArray[np.float64]
 
 # Third differences have 1 + 9 + 9 + 1 times the variance of white noise, and next to no motion.
 THIRD_DIFFERENCE_GAIN = 20.0

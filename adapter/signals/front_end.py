@@ -39,14 +39,8 @@ SAID = {  # of the first sample of each kind; all others are counted
     Verdict.ENCODER_JUMP: "an encoder jumped",
     Verdict.BASE_UNHEARD: "nothing is known of the base's motion; the sample was refused",
 }
-UNSEEN = (
-    Mark.SATURATED_UNTIL,
-    Mark.FIRST_MOVING,
-    Mark.SEEN,
-    Mark.AHEAD,
-    Mark.DOUBTED,
-    Mark.LAST,
-)  # stamps of what has not been yet
+# stamps of what has not been yet
+UNSEEN = (Mark.SATURATED_UNTIL, Mark.FIRST_MOVING, Mark.SEEN, Mark.AHEAD, Mark.DOUBTED, Mark.LAST)
 BASE = 9  # numbers of a floating base's motion in a sample, [v, w, a]
 FASTER = 1.1  # of the documented speed, which is then not the arm's: said, not refused
 
@@ -277,10 +271,8 @@ class FrontEnd:
         if self.layout.floating:
             row[3 * n :] = np.nan if sample.base is None else sample.base
         if not isinstance(sample.stamp_ns, (int, np.integer)):
-            raise DriverError(
-                f"stamp_ns of a sample of the driver is {sample.stamp_ns!r}; it counts whole "
-                "nanoseconds (time.monotonic_ns())"
-            )
+            said = "it counts whole nanoseconds (time.monotonic_ns())"
+            raise DriverError(f"stamp_ns of a sample of the driver is {sample.stamp_ns!r}; {said}")
         answers[0, 0] = sample.stamp_ns
         process(signals, self._packed, self._kept, self._records, answers)
         if answers[0, 1]:
@@ -357,8 +349,6 @@ class FrontEnd:
             ):
                 for j in np.flatnonzero((value < low) | (value > high))[:1]:
                     hint = "; degrees instead of radians?" if signal != "tau" else "; N m?"
-                    return (
-                        f"{at}: {signal} of {self.names[j]} is {value[j]:.4g}, outside "
-                        f"[{low[j]:.4g}, {high[j]:.4g}]{hint}"
-                    )
+                    outside = f"{value[j]:.4g}, outside [{low[j]:.4g}, {high[j]:.4g}]"
+                    return f"{at}: {signal} of {self.names[j]} is {outside}{hint}"
         return f"{at}: {self.fault if reason == Verdict.ENCODER_JUMP else SAID[reason]}"

@@ -19,29 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.model_file import whole_file
+from adapter.signals import source_signals
 from adapter.signals.matching import corresponding, several
-from adapter.signals.source_signals import (
-    ALL,
-    SIGNALS,
-    UNITS,
-    ImportSpec,
-    SourceReader,
-    read_signals,
-    refuse_wild,
-    unit_factor,
-)
 from adapter.signals.source_table import lerobot_joints
 from drivers.errors import choices
+from drivers.files import mcap
 from drivers.files.bounded import read_text
-from drivers.files.mcap import (
-    Log,
-    derive_velocity,
-    is_recording,
-    looks_like_degrees,
-    read_log,
-    read_position_log,
-    write_log,
-)
 from drivers.interface import Array, DriverError
 
 _OF_TABLES = {"columns": {}, "flat": False, "period_s": None, "episode": None}  # not given
@@ -49,8 +32,6 @@ _MOVING = 1e-2  # rad/s, a median slope below it says nothing
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 _STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
 _SAGE = "state_motor", "control"  # files of a folder, .csv or .csv.gz: motion and commands
-_SAGE_JOINTS = "joint_list.txt"
-_SAGE_TIME = "us"
 
 
 @dataclass(frozen=True)
@@ -65,7 +46,7 @@ class ImportReport:
     warnings: list[str]
 
 
-def import_file(spec: ImportSpec, out: Path) -> ImportReport:
+def import_file(spec: source_signals.ImportSpec, out: Path) -> ImportReport:
     """Write a recording from tables or a recording; complete, or not at all under its name.
 
     Raises:
@@ -78,7 +59,9 @@ def import_file(spec: ImportSpec, out: Path) -> ImportReport:
         version = importlib.metadata.version("panda-adapter")
     except importlib.metadata.PackageNotFoundError:
         version = "unknown"
-    recorded = [s for s, x in spec.sources.items() if is_recording(x) and not is_data_set(Path(x))]
+    recorded = [
+        s for s, x in spec.sources.items() if mcap.is_recording(x) and not is_data_set(Path(x))
+    ]
     if any(recorded):
         path = spec.sources[next(filter(None, recorded))]
         raise DriverError(f"{path}: is a recording with all signals; write it without SIGNAL=")
@@ -93,7 +76,7 @@ def import_file(spec: ImportSpec, out: Path) -> ImportReport:
         "topic": log.topic if recorded else None,
     }
     with whole_file(out) as part:
-        write_log(log, part, {"version": version, "imported": source})
+        mcap.write_log(log, part, {"version": version, "imported": source})
     left = [m.topic for m in log.frames if m.frame not in log.link_names]
     if (log.twists is None) != (log.accels is None):
         left.append("the links' motion (a half)")
@@ -118,24 +101,26 @@ def _sage_files(path: Path) -> list[Path]:
     return [file for file in found if file is not None] if all(found) else []
 
 
-def _of_folder(spec: ImportSpec) -> tuple[ImportSpec, tuple[str, ...]]:
+def _of_folder(
+    spec: source_signals.ImportSpec,
+) -> tuple[source_signals.ImportSpec, tuple[str, ...]]:
     """A specification of files where it names a folder, and the joints that this tells."""
-    path = Path(spec.sources.get(ALL, spec.sources.get("q", "")))
-    files = _sage_files(path) if ALL in spec.sources else []
+    path = Path(spec.sources.get(source_signals.ALL, spec.sources.get("q", "")))
+    files = _sage_files(path) if source_signals.ALL in spec.sources else []
     if not files:
         return spec, lerobot_joints(path)
-    sources = {"cmd": files[1], **spec.sources, ALL: files[0]}
-    listed = path / _SAGE_JOINTS
+    sources = {"cmd": files[1], **spec.sources, source_signals.ALL: files[0]}
+    listed = path / "joint_list.txt"
     names = read_text(listed).split() if listed.is_file() else ()
-    return replace(spec, sources=sources, units={"time": _SAGE_TIME, **spec.units}), tuple(names)
+    return replace(spec, sources=sources, units={"time": "us", **spec.units}), tuple(names)
 
 
-def table_log(spec: ImportSpec) -> Log:
+def table_log(spec: source_signals.ImportSpec) -> mcap.Log:
     """What tables say, as a recording in memory. Raises DriverError like `import_file`."""
-    path = Path(spec.sources.get("q", spec.sources.get(ALL, "")))
+    path = Path(spec.sources.get("q", spec.sources.get(source_signals.ALL, "")))
     spec, own = _of_folder(spec)
-    reader = SourceReader(spec, own or spec.joint_names)
-    stamp_ns, q, dq, tau, commands = read_signals(reader, spec)
+    reader = source_signals.SourceReader(spec, own or spec.joint_names)
+    stamp_ns, q, dq, tau, commands = source_signals.read_signals(reader, spec)
     units = reader.units
     where, warnings = str(path), reader.said
     names = reader.joint_names or tuple(f"joint{i + 1}" for i in range(q.shape[1]))
@@ -149,13 +134,15 @@ def table_log(spec: ImportSpec) -> Log:
     signals = {"q": q, "dq": dq, "tau": tau}
     there = {name: values for name, values in signals.items() if values is not None}
     warnings += _value_doubts(where, there, units)
-    said = " ".join(f"{s}={','.join(spec.columns[s])}" for s in SIGNALS if s in spec.columns)
-    log = Log(
+    said = " ".join(
+        f"{s}={','.join(spec.columns[s])}" for s in source_signals.SIGNALS if s in spec.columns
+    )
+    log = mcap.Log(
         path,
         names,
         stamp_ns,
         q,
-        derive_velocity(stamp_ns, q) if dq is None else dq,
+        mcap.derive_velocity(stamp_ns, q) if dq is None else dq,
         np.full_like(q, np.nan) if tau is None else tau,
         commands=commands,
         warnings=warnings,
@@ -164,25 +151,23 @@ def table_log(spec: ImportSpec) -> Log:
     return _with_joints(log, spec)
 
 
-def recording_log(spec: ImportSpec) -> Log:
+def recording_log(spec: source_signals.ImportSpec) -> mcap.Log:
     """What a recording says, in SI, its joints those of the specification, if it names any.
 
     Raises:
         DriverError: like `import_file`; or options go with it that are for tables.
     """
-    path = Path(spec.sources[ALL])
+    path = Path(spec.sources[source_signals.ALL])
     given = [name for name, absent in _OF_TABLES.items() if getattr(spec, name) != absent]
     if "time" in spec.units:
         given.append("units time")
     if given:
-        raise DriverError(
-            f"{path}: is a recording, whose messages have names and stamps; "
-            f"--{given[0].removesuffix('_s')} goes with tables"
-        )
-    factors = {name: unit_factor(spec.units, name) for name in ("q", "dq", "tau")}
-    found = read_position_log(path, spec.topic)
+        said = f"--{given[0].removesuffix('_s')} goes with tables"
+        raise DriverError(f"{path}: is a recording, whose messages have names and stamps; {said}")
+    factors = {name: source_signals.unit_factor(spec.units, name) for name in ("q", "dq", "tau")}
+    found = mcap.read_position_log(path, spec.topic)
     signals = ("q", "dq", "tau") if found is None else ("q",)
-    read = read_log(path, topic=spec.topic, beside="frames") if found is None else found
+    read = mcap.read_log(path, topic=spec.topic, beside="frames") if found is None else found
     # The reader's doubt about degrees is judged again below, in SI.
     doubts = [x for x in read.warnings if "are these degrees?" not in x]
     log = _with_joints(replace(read, warnings=doubts), spec)
@@ -193,13 +178,13 @@ def recording_log(spec: ImportSpec) -> Log:
         commands = replace(commands, tau=commands.tau * factors["tau"], q=q)
     warnings, where = log.warnings, f"{path}: {log.topic}"
     for name in signals:
-        refuse_wild(where, "sample {}".format, name, told[name])
+        source_signals.refuse_wild(where, "sample {}".format, name, told[name])
     warnings += _value_doubts(where, {name: told[name] for name in signals}, spec.units)
     warnings += velocity_doubts(where, log.stamp_ns, told["q"], told["dq"])
     return replace(log, **told, commands=commands, warnings=warnings)
 
 
-def _with_joints(log: Log, spec: ImportSpec) -> Log:
+def _with_joints(log: mcap.Log, spec: source_signals.ImportSpec) -> mcap.Log:
     """The joints wanted under their names, with warnings where they were called otherwise.
 
     Names that differ in nothing but what stands before their number mean the same joint; where no
@@ -234,7 +219,7 @@ def _with_joints(log: Log, spec: ImportSpec) -> Log:
     return replace(chosen, joint_names=want, warnings=warnings)
 
 
-def _renamed(log: Log, spec: ImportSpec) -> list[str]:
+def _renamed(log: mcap.Log, spec: source_signals.ImportSpec) -> list[str]:
     """Names of the recording's joints as the specification has them. Raises DriverError."""
     have, names = list(log.joint_names), dict(spec.names)
     for told in [name for name in names if name.endswith("*")]:
@@ -269,12 +254,10 @@ def _stamp_doubts(
     step_s = float(np.median(np.abs(steps))) * 1e-9 if steps.size else _STEP_S[0]
     if not _STEP_S[0] <= step_s <= _STEP_S[1]:
         said = f"{where}: samples are {step_s:.3g} s apart; is the time in"
-        told = units.get("time")
+        told, have = units.get("time"), ", ".join(source_signals.UNITS["time"])
         if told is None and period_s is None:
-            raise DriverError(
-                f"{said} s? Say --units time=UNIT ({', '.join(UNITS['time'])}; s takes it as it is)"
-            )
-        found.append(f"{said} {told or 's'}? (units: {', '.join(UNITS['time'])})")
+            raise DriverError(f"{said} s? Say --units time=UNIT ({have}; s takes it as it is)")
+        found.append(f"{said} {told or 's'}? (units: {have})")
     return found
 
 
@@ -294,7 +277,7 @@ def _value_doubts(where: str, signals: Mapping[str, Array], units: Mapping[str, 
             found.append(
                 f"{where}: {name} is not a number in {bad.size} samples, first in sample {bad[0]}"
             )
-    if looks_like_degrees(signals["q"]):
+    if mcap.looks_like_degrees(signals["q"]):
         said = (
             f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they degrees?"
         )
@@ -307,14 +290,12 @@ def _value_doubts(where: str, signals: Mapping[str, Array], units: Mapping[str, 
 def velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array) -> list[str]:
     """Whether the velocities are the positions' slope in the same unit."""
     with np.errstate(invalid="ignore"):
-        slopes = np.abs(derive_velocity(stamp_ns, q))
+        slopes = np.abs(mcap.derive_velocity(stamp_ns, q))
     if np.isnan(slopes).all() or np.isnan(dq).all():
         return []
     slope, said = np.nanmedian(slopes), np.nanmedian(np.abs(dq))
     ratio = said / slope if slope > _MOVING and said > 0 else 1.0
     if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
         return []
-    return [
-        f"{where}: velocities are {ratio:.3g} times the slope of the positions; are the units "
-        "of q, dq and time right?"
-    ]
+    said = "the slope of the positions; are the units of q, dq and time right?"
+    return [f"{where}: velocities are {ratio:.3g} times {said}"]

@@ -14,7 +14,6 @@ from drivers.files.mcap import Log, read_log, read_position_log
 from drivers.interface import Array, DriverError
 
 _PART = "chunk-000/file-000.parquet"
-_ANY_PART = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _TASK = {"task": ["motion"], "task_index": [0]}
 _INDEXED = {  # so that pandas takes the tasks for the index, as LeRobot does
     "index_columns": ["task"],
@@ -52,15 +51,12 @@ def write_lerobot(path: Path, folder: Path) -> list[str]:
     counted = {"frame_index": np.arange(rows), "index": np.arange(rows)}
     counted |= {key: np.zeros(rows, dtype=np.int64) for key in ("episode_index", "task_index")}
     single: dict[str, NDArray[Any]] = {"timestamp": since_s.astype(np.float32), **counted}
-    features: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": [n], "names": names} for key in told
-    }
+    wide = {"dtype": "float32", "shape": [n], "names": names}
+    features: dict[str, Any] = {key: dict(wide) for key in told}
     for key, x in single.items():
         features[key] = {"dtype": str(x.dtype), "shape": [1], "names": None}
-    lists = {
-        key: pa.FixedSizeListArray.from_arrays(pa.array(x.astype(np.float32).ravel()), n)
-        for key, x in told.items()
-    }
+    flat = {key: pa.array(x.astype(np.float32).ravel()) for key, x in told.items()}
+    lists = {key: pa.FixedSizeListArray.from_arrays(x, n) for key, x in flat.items()}
     stats: dict[str, dict[str, list[Any]]] = {}
     for key, x in {**told, **single}.items():
         table = x.reshape(rows, -1)
@@ -78,12 +74,12 @@ def write_lerobot(path: Path, folder: Path) -> list[str]:
     ):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         parquet.write_table(table, folder / name)
-    parts = {"data": f"data/{_ANY_PART}", "video": None}
+    any_part = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     sizes = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
     totals = {"total_episodes": 1, "total_frames": rows, "total_tasks": 1}
     info = {"codebase_version": "v3.0", "robot_type": None, "fps": fps, **totals, **sizes}
     info |= {"splits": {"train": "0:1"}, "features": features}
-    info |= {f"{kind}_path": part for kind, part in parts.items()}
+    info |= {"data_path": any_part, "video_path": None}
     for name, content in (("stats", stats), ("info", info)):  # a folder without the last is none
         (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=4))
     return said

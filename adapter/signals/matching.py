@@ -28,17 +28,13 @@ def present(
         The robot, and a sentence where joints were locked.
     """
     still = [frame.joint for frame in documented.frames if frame.joint in names]
-    idle = [
-        f"{source}: has {', '.join(still)}, which {documented.name} holds still (--joints A,B,... "
-        "with them among these learns them)"
-    ] * bool(still)
+    how = "holds still (--joints A,B,... with them among these learns them)"
+    idle = [f"{source}: has {', '.join(still)}, which {documented.name} {how}"] if still else []
     absent = [name for name in documented.tree.joint_names if name not in names]
     if not absent or len(absent) == documented.tree.n:
         return documented, idle
-    said = (
-        f"{source}: has no joint {', '.join(absent)}; locked at zero in {documented.name} "
-        "(--lock JOINT=VALUE gives another value)"
-    )
+    said = f"{source}: has no joint {', '.join(absent)}; locked at zero in {documented.name} "
+    said += "(--lock JOINT=VALUE gives another value)"
     return locked(documented, dict.fromkeys(absent, 0.0)), [said, *idle]
 
 
@@ -94,10 +90,8 @@ def matching(log: Log, documented: SelfModel) -> Log:
     heard = all(links) and log.twists is not None and log.accels is not None
     if tree.floating:  # see `twist`
         if heard:
-            more.append(
-                f"{log.path}: the measured motion of links is not used where the base floats; it "
-                "is synthesized"
-            )
+            said = "is not used where the base floats; it is synthesized"
+            more.append(f"{log.path}: the measured motion of links {said}")
         heard = False
     elif log.link_names and not heard:
         more.append(
@@ -117,9 +111,8 @@ def corresponding(
         return list(want), []
     starts = prefixes(want, have)
     if len(starts) == 1:  # of a namespace, beside joints of other things
-        return [f"{starts[0]}{name}" for name in want], [
-            f"{what} names are taken without the {starts[0]} before them"
-        ]
+        said = f"{what} names are taken without the {starts[0]} before them"
+        return [f"{starts[0]}{name}" for name in want], [said]
     if len(have) != len(want):
         return [name if name in have else None for name in want], []
     number = {_number(name): name for name in have}
@@ -141,10 +134,8 @@ def several(want: Sequence[str], log: Log) -> str:
     arms = prefixes(want, log.joint_names)
     if len(arms) < 2:
         return ""
-    return (
-        f"{log.path}: has {len(arms)} such arms, {' and '.join(arms)}; take one: "
-        f"adapter import {log.path} --names '{arms[0]}*=*' --to FILE"
-    )
+    one = f"adapter import {log.path} --names '{arms[0]}*=*' --to FILE"
+    return f"{log.path}: has {len(arms)} such arms, {' and '.join(arms)}; take one: {one}"
 
 
 def _number(name: str) -> str:

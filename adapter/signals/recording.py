@@ -9,16 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.files.mcap import (
-    JOINT_COMMANDS,
-    Log,
-    derive_velocity,
-    looks_like_degrees,
-    read_log,
-    read_position_log,
-    sample_log,
-    survey,
-)
+from drivers.files import mcap
 from drivers.interface import Array, DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
@@ -27,7 +18,7 @@ _FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below whic
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
-def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]:
+def describe(path: str | Path | mcap.Log, topic: str | None = None) -> dict[str, Any]:
     """A recording's contents and health, ready for JSON.
 
     Of a file without usable joint states only its topics are told, and `problem` says what is
@@ -42,11 +33,11 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     Raises:
         DriverError: the file is unreadable, empty or not MCAP.
     """
-    path, log = (path.path, path) if isinstance(path, Log) else (Path(path), None)
+    path, log = (path.path, path) if isinstance(path, mcap.Log) else (Path(path), None)
     try:
         looked = _look(path, log, topic)
     except DriverError as error:
-        topics, warnings, truncated = survey(path)
+        topics, warnings, truncated = mcap.survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
     else:
         first, warnings = looked.parts[0], looked.warnings
@@ -71,16 +62,16 @@ class _Looked(NamedTuple):
         holes: (s since the first sample, s) that are known beside those in the parts.
     """
 
-    parts: list[Log]
+    parts: list[mcap.Log]
     samples: int
     commands: int
     warnings: list[str]
     holes: list[tuple[float, float]]
 
 
-def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
+def _look(path: Path, log: mcap.Log | None, topic: str | None) -> _Looked:
     """A recording, a long one by a sample. Raises DriverError."""
-    sample = sample_log(path, topic, "frames") if log is None else None
+    sample = mcap.sample_log(path, topic, "frames") if log is None else None
     holes: list[tuple[float, float]] = []
     if sample is None:
         log = _read(path, topic) if log is None else log
@@ -88,7 +79,7 @@ def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
         commands = 0 if log.commands is None else len(log.commands.stamp_ns)
     else:
         parts, holes = sample
-        log, told, part = parts[0], parts[0].topics.get(JOINT_COMMANDS), True
+        log, told, part = parts[0], parts[0].topics.get(mcap.JOINT_COMMANDS), True
         samples = log.topics[log.topic].messages
         commands = 0 if told is None or log.commands is None else told.messages
     judged = (
@@ -99,23 +90,23 @@ def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
     return _Looked(parts, samples, commands, [*log.warnings, *([judged] if part else [])], holes)
 
 
-def _read(path: Path, topic: str | None) -> Log:
+def _read(path: Path, topic: str | None) -> mcap.Log:
     """A recording, also one of commanded and measured positions alone. Raises DriverError."""
     log, trouble = None, None
     try:
-        log = read_log(path, topic=topic, beside="frames")
+        log = mcap.read_log(path, topic=topic, beside="frames")
     except DriverError as error:
         trouble = error
     if log is None or not (log.is_mapped or np.any(np.nan_to_num(log.tau))):
         with suppress(DriverError):  # the first one says what is wrong
-            log = read_position_log(path, topic) or log
+            log = mcap.read_position_log(path, topic) or log
     if log is None:
         assert trouble is not None
         raise trouble
     return log
 
 
-def _of_servos(log: Log) -> bool:
+def _of_servos(log: mcap.Log) -> bool:
     """Whether it tells positions and commanded ones, and no efforts."""
     return log.commands is not None and log.commands.q is not None and bool(np.isnan(log.tau).all())
 
@@ -138,14 +129,10 @@ def summary(facts: dict[str, Any]) -> list[str]:
 def _signal_lines(facts: dict[str, Any]) -> list[str]:
     gaps, period, rate = facts["gaps"], facts["period_ms"], facts["rate_hz"]
     count = len(facts["joints"])
-    steps = (
-        ""
-        if period is None
-        else (
-            f", steps {period['p50']:.3g} ms (longest 1 %: {period['p99']:.3g}, longest "
-            f"{period['max']:.3g})"
-        )
-    )
+    steps = ""
+    if period is not None:
+        longest = f"longest 1 %: {period['p99']:.3g}, longest {period['max']:.3g}"
+        steps = f", steps {period['p50']:.3g} ms ({longest})"
     others = [f"{facts['commands']} commanded {facts['commanded']}"] if facts["commands"] else []
     off = [f"{1e3 * x:.3g}" for x in facts["tracking_error_rad"] or ()]
     others += [f"motion of {name}" for name in (*facts["links"], *facts["frames"])]
@@ -168,11 +155,11 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _units(parts: list[Log], q: Array, dq: Array, tau: Array) -> str:
+def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array) -> str:
     """What the numbers look like; a joint's torque has no size that all arms share."""
-    said = ["positions look like degrees" if looks_like_degrees(q) else "positions rad"]
+    said = ["positions look like degrees" if mcap.looks_like_degrees(q) else "positions rad"]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slope = np.abs(np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts]))
+        slope = np.abs(np.concatenate([mcap.derive_velocity(x.stamp_ns, x.q) for x in parts]))
         fast = slope > _FAST
         ratio = float(np.median((np.abs(dq) / slope)[fast])) if fast.any() else np.nan
     if _of_servos(parts[0]):
@@ -222,7 +209,7 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
         error = log.commands.q[at[at >= 0]] - log.q[at >= 0]  # a command holds until the next
         tracking_error_rad = np.sqrt(np.mean(error**2, axis=0)).tolist() if len(error) else []
         signals, judged = {"q_rad": q}, ["q"]
-        dq = np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts])
+        dq = np.concatenate([mcap.derive_velocity(x.stamp_ns, x.q) for x in parts])
     repeated = 0
     for part in parts:
         tables = (getattr(part, key) for key in judged)
@@ -292,9 +279,5 @@ def _gaps(looked: _Looked) -> dict[str, Any]:
     listed = [
         {"after_s": float(after_s[i]), "length_s": float(steps_s[i])} for i in places[:_LISTED]
     ]
-    return {
-        "longer_than_s": hole_s,
-        "count": int(places.size),
-        "longest_s": float(steps_s.max(initial=0)),
-        "first": listed,
-    }
+    count, longest_s = int(places.size), float(steps_s.max(initial=0))
+    return {"longer_than_s": hole_s, "count": count, "longest_s": longest_s, "first": listed}

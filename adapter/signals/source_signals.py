@@ -355,10 +355,8 @@ def read_signals(
     samples = len(q) if times is None else len(times)
     if times is None and spec.flat:
         if not reader.joint_names:
-            raise DriverError(
-                f"{reader.source('q')}: how many values make a sample? Name the joints, or a time "
-                "file"
-            )
+            said = "how many values make a sample? Name the joints, or a time file"
+            raise DriverError(f"{reader.source('q')}: {said}")
         samples = q.size // len(reader.joint_names)
     seconds = np.arange(samples) * (spec.period_s or 0.0) if times is None else times[:, 0]
     stamp_ns = _stamps(reader, "time", seconds)

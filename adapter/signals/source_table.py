@@ -24,12 +24,9 @@ from drivers.files.bounded import ARRAYS_LIMIT, parse_json, read_arrays, read_te
 from drivers.interface import Array, DriverError
 
 _SEPARATORS = (";", "\t", "|", ",")
-_GZIP = b"\x1f\x8b"
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # of a header: pos [deg] or time_ms, not q[0]
 _UNIT = re.compile(r"\s*[\[(]\s*([^\d\])][^\])]*)[\])]\s*$|_(ms|us|ns|deg|rad|mNm|Nm)$")
-_INDEX = re.compile(r"\d+")
-_RANGE = re.compile(r"(\d*):(\d*)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +65,9 @@ class SourceTable:
         for place in places:
             row, word = self.words.get(place, (0, ""))
             if place in self.words and (word or not blanks):
-                raise DriverError(_no_number(self, row, place, word))
+                named = f" ({self.names[place]})" if self.names else ""
+                at = f"{self.path}: {self.place(row)}, column {place}{named}"
+                raise DriverError(f"{at}: '{word}' is not a number")
         return self.values[:, list(places)]
 
     def is_text(self, place: int) -> bool:
@@ -77,17 +76,15 @@ class SourceTable:
 
     def _places(self, selector: str, what: str) -> list[int]:
         count = self.values.shape[1]
-        if _INDEX.fullmatch(selector):
+        if re.fullmatch(r"\d+", selector):
             first, last = int(selector), int(selector) + 1
-        elif match := _RANGE.fullmatch(selector):
+        elif match := re.fullmatch(r"(\d*):(\d*)", selector):
             first, last = int(match[1] or 0), int(match[2] or count)
         else:
             return self._named(selector, what)
         if not first < last <= count:
-            raise DriverError(
-                f"{self.path}: column {selector} for {what} isn't there; it has {count} columns, "
-                f"0 to {count - 1}{self._having()}"
-            )
+            has = f"it has {count} columns, 0 to {count - 1}{self._having()}"
+            raise DriverError(f"{self.path}: column {selector} for {what} isn't there; {has}")
         return list(range(first, last))
 
     def _named(self, selector: str, what: str) -> list[int]:
@@ -113,11 +110,6 @@ class SourceTable:
 
     def _having(self) -> str:
         return f"; named {', '.join(self.names)}" if self.names else ""
-
-
-def _no_number(table: SourceTable, row: int, place: int, word: str) -> str:
-    named = f" ({table.names[place]})" if table.names else ""
-    return f"{table.path}: {table.place(row)}, column {place}{named}: '{word}' is not a number"
 
 
 def read_table(path: Path) -> SourceTable:
@@ -303,7 +295,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     """Line numbers from 1 and stripped lines, without empty ones."""
     try:
         with path.open("rb") as file:
-            packed = file.read(len(_GZIP)) == _GZIP
+            packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             source = gzip.GzipFile(fileobj=file) if packed else file
             raw = source.read(ARRAYS_LIMIT + 1)

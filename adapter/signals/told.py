@@ -112,8 +112,6 @@ def told_of(log: Log) -> Told:
 
 def _per_joint(values: tuple[float, ...], names: Sequence[str], option: str) -> Array:
     if len(values) not in (0, 1, len(names)):
-        raise SettingsError(
-            f"{option} takes one number for all joints or one for each of {', '.join(names)} "
-            f"({len(names)}), got {len(values)}"
-        )
+        each = f"one for each of {', '.join(names)} ({len(names)}), got {len(values)}"
+        raise SettingsError(f"{option} takes one number for all joints or {each}")
     return np.asarray(np.broadcast_to(np.array(values or (1.0,)), len(names)), dtype=float)

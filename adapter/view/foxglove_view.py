@@ -34,7 +34,6 @@ from drivers.files.mcap.writer import EXTERNAL_TORQUES
 from drivers.files.messages import Message, encode, header
 from drivers.files.ros_types import JOINT_STATE, STRING, schemas
 
-BACKLOG = 64  # messages that wait for a slow client; then the oldest go
 DESCRIPTION_S = 2.0  # what is said once comes again and again: nobody is told what was before
 NONE: Array = np.zeros(0)
 TOPICS = {
@@ -99,7 +98,7 @@ class FoxgloveView:
                 port=port,
                 context=context,
                 session_id=known.key or None,
-                message_backlog_size=BACKLOG,
+                message_backlog_size=64,  # messages that wait for a slow client; then the oldest go
             )
         except (RuntimeError, OSError) as error:
             raise MeansError(f"nothing can be served on port {port}: {error}") from None

@@ -11,7 +11,7 @@ import can
 import numpy as np
 
 from drivers.damiao import codec
-from drivers.damiao.bus import MulticastWire, Wire, open_bus, wire_of
+from drivers.damiao.bus import Wire, open_bus, wire_of
 from drivers.damiao.codec import CODES, MIT_MODE, TIMEOUT_UNIT_S, Scales, mit_command
 from drivers.damiao.connect import Dialogue
 from drivers.damiao.guardian import GuardianMode
@@ -127,7 +127,6 @@ class DamiaoArm:
 
     Attributes:
         limits: of each motor, as it said itself; empty before `connect`.
-        guardian_pid: of the process that holds the arm; None without one.
 
     Raises:
         DriverError: the address is wrong, or its frames do not fit on the bus.
@@ -159,11 +158,6 @@ class DamiaoArm:
         self._given_bus, self._now_ns, self._wall_ns = bus, now_ns, wall_ns
         self._bus: can.BusABC | None = None
         self._guardian: GuardianClient | None = None
-
-    @property
-    def guardian_pid(self) -> int | None:
-        """See the class."""
-        return None if self._guardian is None else self._guardian.pid
 
     def connect(self) -> None:
         """Open the bus, ask the motors who they are; with leave to move, enable and hold them.
@@ -209,8 +203,6 @@ class DamiaoArm:
             self.can_move,
         )
         self._stream = MotorStream(self._wire, self.settings, replies, self._now_ns, self._wall_ns)
-        if isinstance(self._wire, MulticastWire):
-            self._wire.ignore(self.settings.ids[-1] + 1)
         replies.others_ask = self._guardian is not None
         strange = [j + 1 for j, x in enumerate(self.limits) if type_of(x) == "unknown type"]
         if strange:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import socket
 import struct
@@ -18,9 +17,6 @@ from drivers.interface import DriverError
 BATCH_LIMIT = 512  # frames in one go; a babbling bus must not stop the loop
 DATAGRAM_BYTES, ANCILLARY_BYTES = 4096, 128
 BUFFER_BYTES = 1 << 20
-SO_ATTACH_FILTER = 26  # Linux; what it takes sees a datagram from its UDP header on
-UDP_HEADER_BYTES = 8
-ID_AT = len(b"\x8b\xa9timestamp\xcb12345678\xaearbitration_id")  # in a packed frame
 TIMESPEC = struct.Struct("@ll")  # of SO_TIMESTAMPNS
 UNREADABLE = -1  # in place of an id: bytes that are no CAN frame
 ERROR_FRAME, NOT_A_REPLY = 1, 2
@@ -62,7 +58,7 @@ class MulticastWire(Wire):
     """The frames of python-can's udp_multicast bus, read from its socket.
 
     python-can takes 13 us for a frame, builds a Message and stops at the first datagram that is
-    no frame; and it hands back every frame the driver sent itself. This takes 4 us.
+    no frame. This takes 4 us.
     """
 
     def __init__(self, bus: can.BusABC) -> None:
@@ -70,29 +66,6 @@ class MulticastWire(Wire):
         self._socket = socket.socket(fileno=os.dup(bus.fileno()))
         with contextlib.suppress(OSError):  # the kernel's usual 200 kB last for 256 frames
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-
-    def ignore(self, below: int) -> None:
-        """Let the kernel drop frames with an id from 0 on and under `below` (at most 128).
-
-        They are the driver's own, half of all. A classic BPF program reads the byte in which
-        python-can puts such an id; where the kernel has none, they are looked at as all others.
-        """
-        with contextlib.suppress(OSError):
-            lines = (
-                (0x80, 0, 0, 0),  # the length
-                (0x25, 0, 4, UDP_HEADER_BYTES + ID_AT),  # not greater: keep, it is no frame
-                (0x30, 0, 0, UDP_HEADER_BYTES + ID_AT - 1),  # the last letter of the id's name
-                (0x15, 0, 2, ord("d")),  # another: keep
-                (0x30, 0, 0, UDP_HEADER_BYTES + ID_AT),  # the id, where it is below 128
-                (0x35, 0, 1, below),  # less: drop
-                (0x06, 0, 0, DATAGRAM_BYTES),  # keep
-                (0x06, 0, 0, 0),  # drop
-            )
-            program = ctypes.create_string_buffer(
-                b"".join(struct.pack("@HBBI", *line) for line in lines)
-            )
-            head = struct.pack("@HP", len(lines), ctypes.addressof(program))
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, head)
 
     def waiting(self) -> list[Frame]:
         """See `Wire`."""

@@ -16,7 +16,6 @@ from drivers.damiao.tables import COMMUNICATION_LOST, DISABLED, ENABLED, fault_o
 from drivers.interface import DriverError
 
 REPLY_TIMEOUT_S, TRIES = 0.05, 4
-PLAUSIBLE_LIMIT = 1000.0  # rad, rad/s, N m: no motor's register says more
 NAP_S = 0.0002
 
 T = TypeVar("T")
@@ -137,7 +136,7 @@ class Dialogue:
                 limits = Scales(*values)
             except WireError as error:
                 raise DriverError(f"motor {can_id}: {error}; check registers 21 to 23") from error
-            if max(values) > PLAUSIBLE_LIMIT:
+            if max(values) > 1000.0:  # rad, rad/s, N m: no motor's register says more
                 raise DriverError(f"motor {can_id} says {limits}; check registers 21 to 23")
             found.append(limits)
         return found

@@ -13,9 +13,6 @@ from drivers.interface import Array, DriverError
 
 WINDOW_NS = 50_000_000
 LEAST_WINDOWS, MOST_WINDOWS = 10, 60  # 0.5 s to 3 s of windows
-TOLERANCE = 0.1  # of the slope
-CERTAINTY = 6.0  # standard deviations that a wrong slope must lie off
-PRECISION = 0.02  # standard deviation of a slope that counts
 FIT = 0.995  # correlation of a slope that counts: a stuck encoder is something else
 # rad: changes of q are known to a step's 1/sqrt(6), a step being at most 25 rad / 65535
 Q_NOISE = 25.0 / 65535 / 6.0**0.5
@@ -71,9 +68,9 @@ class SpeedCheck:
         fit = 1.0 - rest / np.maximum((integral**2).sum(axis=0), 1e-300)
         off = np.abs(slope - 1.0)
         wrong = (
-            (off > TOLERANCE)
-            & (off > CERTAINTY * deviation)
-            & (deviation < PRECISION)
+            (off > 0.1)  # of the slope
+            & (off > 6.0 * deviation)  # standard deviations that a wrong slope must lie off
+            & (deviation < 0.02)  # standard deviation of a slope that counts
             & (fit > FIT**2)
         )
         for j in np.flatnonzero(wrong)[:1]:

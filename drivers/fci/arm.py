@@ -109,16 +109,6 @@ class FciArm:
         """Datagrams that the operating system dropped; part of `intake.lost`."""
         return self._account.kernel_drops
 
-    @property
-    def reader_pid(self) -> int | None:
-        """Process id of the reader; None when not connected."""
-        return None if self._connection is None else self._connection.reader.pid
-
-    @property
-    def spare_pid(self) -> int | None:
-        """Process id of the reader that waits beside it; None when not connected."""
-        return None if self._connection is None else self._connection.reader.spare_pid
-
     def connect(self) -> None:
         """Open the connection and wait for a state; an open one is closed before.
 

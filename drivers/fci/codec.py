@@ -21,66 +21,32 @@ from drivers.interface import Array, DriverError
 JOINTS = 7
 MAX_ID: Final = 1 << 40  # ticks of 1 ms; no robot runs for 34 years
 _ID = struct.Struct("<Q")
-_COUNTS: tuple[tuple[str, int], ...] = (  # numbers of a state up to the accelerometers, in order
-    ("O_T_EE", 16),
-    ("O_T_EE_d", 16),
-    ("F_T_EE", 16),
-    ("EE_T_K", 16),
-    ("F_T_NE", 16),
-    ("NE_T_EE", 16),
-    ("m_ee", 1),
-    ("I_ee", 9),
-    ("F_x_Cee", 3),
-    ("m_load", 1),
-    ("I_load", 9),
-    ("F_x_Cload", 3),
-    ("elbow", 2),
-    ("elbow_d", 2),
-    ("tau_J", 7),
-    ("tau_J_d", 7),
-    ("dtau_J", 7),
-    ("q", 7),
-    ("q_d", 7),
-    ("dq", 7),
-    ("dq_d", 7),
-    ("ddq_d", 7),
-    ("joint_contact", 7),
-    ("cartesian_contact", 6),
-    ("joint_collision", 7),
-    ("cartesian_collision", 6),
-    ("tau_ext_hat_filtered", 7),
-    ("O_F_ext_hat_K", 6),
-    ("K_F_ext_hat_K", 6),
-    ("O_dP_EE_d", 6),
-    ("O_ddP_O", 3),
-    ("elbow_c", 2),
-    ("delbow_c", 2),
-    ("ddelbow_c", 2),
-    ("O_T_EE_c", 16),
-    ("O_dP_EE_c", 6),
-    ("O_ddP_EE_c", 6),
-    ("theta", 7),
-    ("dtheta", 7),
-)
-_ACCELEROMETERS: tuple[tuple[str, int], ...] = (
-    ("accelerometer_top", 18),
-    ("accelerometer_bottom", 18),
-)
-_COMMAND_FIELDS: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = [
-    ("message_id", "<u8"),
-    ("q_c", "<f8", (7,)),
-    ("dq_c", "<f8", (7,)),
-    ("O_T_EE_c", "<f8", (16,)),
-    ("O_dP_EE_c", "<f8", (6,)),
-    ("elbow_c", "<f8", (2,)),
-    ("valid_elbow", "u1"),
-    ("motion_generation_finished", "u1"),
-    ("tau_J_d", "<f8", (7,)),
-]
-COMMAND_DTYPE: dict[int, np.dtype[np.void]] = {
-    tables.PANDA: np.dtype(_COMMAND_FIELDS),
-    tables.FR3: np.dtype([*_COMMAND_FIELDS, ("torque_command_finished", "u1")]),
+
+
+class _Places(NamedTuple):
+    """Where lies what the driver uses: in a state from `load` to `size`, in a command the rest.
+
+    A state's numbers are of one type. At `load` are mass, inertia (9) and centre (3) of the load;
+    from `torques` on tau_J, tau_J_d, dtau_J, q, q_d and dq, seven each; from `modes` on the bytes
+    of motion generator, controller, errors, reflex reasons and robot mode. A command's torques are
+    the last numbers of it.
+    """
+
+    wire: np.dtype[np.floating]
+    load: int
+    torques: int
+    modes: int
+    rate: int
+    size: int
+    finished: int
+    command_size: int
+
+
+_PLACES = {
+    tables.PANDA: _Places(np.dtype("<f8"), 880, 1016, 2280, 2365, 2373, 313, 370),
+    tables.FR3: _Places(np.dtype("<f4"), 444, 512, 1288, 1373, 1377, 370, 371),
 }
+_COMMAND_TORQUES = 314
 HEADER = struct.Struct("<III")  # command, command id, size with header
 LONGEST = 1 << 24  # bytes of a message; a robot model has about 10 kB
 _CONNECT = struct.Struct("<HH")
@@ -91,31 +57,6 @@ _DEVIATION = (10.0, 3.12, 2.0 * math.pi)
 
 class WireError(DriverError):
     """Bytes that are no valid message of this protocol version; the message says why."""
-
-
-def _state_dtype(number: str, counts: tuple[tuple[str, int], ...]) -> np.dtype[np.void]:
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = [("message_id", "<u8")]
-    fields += [(name, number, (count,)) for name, count in counts]
-    fields += [
-        ("motion_generator_mode", "u1"),
-        ("controller_mode", "u1"),
-        ("errors", "u1", (ERROR_COUNT,)),
-        ("reflex_reason", "u1", (ERROR_COUNT,)),
-        ("robot_mode", "u1"),
-        ("control_command_success_rate", number),
-    ]
-    return np.dtype(fields)
-
-
-STATE_DTYPE: dict[int, np.dtype[np.void]] = {
-    tables.PANDA: _state_dtype("<f8", _COUNTS),
-    tables.FR3: _state_dtype("<f4", _COUNTS + _ACCELEROMETERS),
-}
-
-
-def _offset(dtype: np.dtype[np.void], name: str) -> int:
-    assert dtype.fields is not None
-    return dtype.fields[name][1]
 
 
 def id_at(data: memoryview, start: int) -> int:
@@ -165,15 +106,9 @@ class StateDecoder:
     """
 
     def __init__(self, version: int) -> None:
-        dtype = STATE_DTYPE[version]
-        self.version, self.size = version, dtype.itemsize
-        single = version == tables.FR3
-        self._wire = np.dtype("<f4" if single else "<f8")
-        self._numbers, self._load = _offset(dtype, "tau_J"), _offset(dtype, "m_load")
-        self._count = (_offset(dtype, "dq_d") - self._numbers) // self._wire.itemsize
-        self._status_from = _offset(dtype, "motion_generator_mode")
-        self._status_to = _offset(dtype, "control_command_success_rate")
-        self._rate = struct.Struct("<f" if single else "<d")
+        self.version, self._at = version, _PLACES[version]
+        self.size, self._wire = self._at.size, self._at.wire
+        self._rate = struct.Struct("<f" if version == tables.FR3 else "<d")
         self._last_bytes: bytes | None = None
         self._last: Status | None = None
 
@@ -191,11 +126,11 @@ class StateDecoder:
         message_id = id_at(data, start)
         if message_id > MAX_ID:
             raise WireError(f"a state with the absurd message id {message_id}")
-        status_bytes = bytes(data[start + self._status_from : start + self._status_to])
+        status_bytes = bytes(data[start + self._at.modes : start + self._at.rate])
         if status_bytes != self._last_bytes or self._last is None:
             self._last = _status(status_bytes, self.version)
             self._last_bytes = status_bytes
-        wire = np.frombuffer(data, self._wire, self._count, start + self._numbers)
+        wire = np.frombuffer(data, self._wire, 6 * JOINTS, start + self._at.torques)
         numbers = wire.astype(np.float64)
         return State(
             message_id,
@@ -204,17 +139,17 @@ class StateDecoder:
             numbers[0:7],
             numbers[7:14],
             self._last,
-            self._rate.unpack_from(data, start + self._status_to)[0],
+            self._rate.unpack_from(data, start + self._at.rate)[0],
         )
 
     def accepted(self, data: memoryview, start: int) -> Array:
         """(7,) the torque command that the robot accepted last, N m, of the state at `start`."""
-        at = start + self._numbers + JOINTS * self._wire.itemsize
+        at = start + self._at.torques + JOINTS * self._wire.itemsize
         return np.frombuffer(data, self._wire, JOINTS, at).astype(np.float64)
 
     def load(self, data: memoryview, start: int) -> Array:
         """(13,) of the state at `start`: mass (kg), inertia (9,) and centre (3,) of the load."""
-        return np.frombuffer(data, self._wire, 13, start + self._load).astype(np.float64)
+        return np.frombuffer(data, self._wire, 13, start + self._at.load).astype(np.float64)
 
 
 def _status(data: bytes, version: int) -> Status:
@@ -236,16 +171,13 @@ class CommandEncoder:
     """Encodes torque commands of one protocol version into one buffer, used again and again."""
 
     def __init__(self, version: int) -> None:
-        dtype = COMMAND_DTYPE[version]
-        kind = "torque_command" if version == tables.FR3 else "motion_generation"
-        self._buffer = bytearray(dtype.itemsize)
-        self._torques = struct.Struct("<7d")
-        self._at, self._finish = _offset(dtype, "tau_J_d"), _offset(dtype, f"{kind}_finished")
+        self._buffer = bytearray(_PLACES[version].command_size)
+        self._torques, self._finish = struct.Struct("<7d"), _PLACES[version].finished
 
     def encode(self, message_id: int, tau: Sequence[float], finished: bool = False) -> bytearray:
         """The datagram that answers a state with 7 torques, N m; valid until the next call."""
         _ID.pack_into(self._buffer, 0, message_id)
-        self._torques.pack_into(self._buffer, self._at, *tau)
+        self._torques.pack_into(self._buffer, _COMMAND_TORQUES, *tau)
         self._buffer[self._finish] = finished
         return self._buffer
 

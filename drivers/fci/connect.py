@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from drivers.address import Address
 from drivers.fci import codec, tables
-from drivers.fci.codec import STATE_DTYPE, StateDecoder, WireError
+from drivers.fci.codec import StateDecoder, WireError
 from drivers.fci.reader_client import ReaderClient, open_udp
 from drivers.interface import DriverError, NotReady
 
@@ -212,7 +212,7 @@ def _try(target: Target, version: int) -> tuple[Connection | None, int]:
             )
         if status == 0 and target.version is None:
             length = connection.reader.next_length(FIRST_STATE_S)
-            server = tables.FR3 if length == STATE_DTYPE[tables.FR3].itemsize else server
+            server = tables.FR3 if length == StateDecoder(tables.FR3).size else server
     except BaseException:
         connection.close()
         raise

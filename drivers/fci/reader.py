@@ -40,7 +40,6 @@ SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40  # <asm-generic/socket.h>
 TIME_OUT_S = 0.25  # between two looks whether the driver still lives
 _TIMESPEC = struct.Struct("@qq")
 _COUNT = struct.Struct("@I")
-_LONGEST_WAIT_NS = 2_000_000_000  # in the socket's buffer; beyond, the wall clock has jumped
 
 
 def slot_size(state_size: int) -> int:
@@ -65,7 +64,7 @@ def arrival_ns(wall_ns: int) -> int:
     """A kernel's receive time of CLOCK_REALTIME as CLOCK_MONOTONIC; now where it cannot be."""
     now_ns = time.monotonic_ns()
     waited_ns = time.time_ns() - wall_ns
-    if 0 <= waited_ns <= _LONGEST_WAIT_NS:
+    if 0 <= waited_ns <= 2_000_000_000:  # in the socket's buffer; beyond, the wall clock has jumped
         return now_ns - waited_ns
     return now_ns
 

@@ -16,7 +16,6 @@ FLAGS = ("learned", "lambda_source", "lambda_converged", "theta_converged")
 JOINT_TABLES = ("lambda", "lambda_std", "offset")
 BODY_TABLES = ("theta", "theta_std")
 EFFECT_TABLES = ("effects", "effects_std", "effect_shapes")
-_NUMBERS = (*JOINT_TABLES, *BODY_TABLES, *EFFECT_TABLES, "torque_std")
 
 
 @dataclass(frozen=True)
@@ -94,15 +93,6 @@ def estimate_values(fields: Fields) -> dict[str, Any]:
     found["joint_names"] = tuple(row["name"] for row in joints)
     found["body_names"] = tuple(row["name"] for row in bodies)
     found["effect_names"] = tuple(dict.fromkeys(x["effect"] for x in effects))
-    return found
-
-
-def values_of_json(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The same of a JSON estimate, which recordings before version 0.2 hold: fewer of them."""
-    found = dict(entry)
-    for key in _NUMBERS:
-        if key in found:
-            found[key] = np.array(found[key], dtype=np.float64)  # null becomes not-a-number
     return found
 
 

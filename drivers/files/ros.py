@@ -32,7 +32,6 @@ ODOMETRY_DOUBLES = 85  # pose 7, its covariance 36, twist 6 (child frame), its c
 _COLLISION_DOUBLES = 26
 # of a FrankaState behind its header: two of flags, q q_d dq dq_d ddq_d theta dtheta tau
 _FRANKA_RUNS = (6, 6, 7, 7, 7, 7, 7, 7, 7, 7)
-_LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
 class CdrError(ValueError):
@@ -221,7 +220,7 @@ def decode_many(
             bad.append((int(left[0]), str(error)))
             left = left[1:]
             continue
-        if len(blocks) < _LAYOUTS_VECTORISED:
+        if len(blocks) < 16:  # beyond this many layouts in one batch, messages are read one by one
             candidates = rows if left.size == len(rows) else rows[left]
             same, start = np.ones(len(candidates), dtype=np.bool_), 0
             for run in (_STAMP, *(layout.varying or layout.doubles)):

@@ -37,7 +37,6 @@ from drivers.ros2.settings import EXAMPLE, parse
 
 READY_S, STOP_S, END_S = 60.0, 3.0, 2.0
 POLL_S = 0.002
-TRANSPORT_NS = 1_000_000  # of a command, from here to the controller
 NOTES = {
     Refusal.UNREADABLE: "joint states come that cannot be read; is it another type that is sent?",
     Refusal.OTHER_JOINTS: "joint states of other joints come on the same topic; they are left out",
@@ -84,15 +83,10 @@ class Ros2Arm:
         self.can_move = allow_motion
         self.adds_gravity = where.gravity
         self.period_ns = round(1e9 / where.hz)
-        self.delay_ns = self.period_ns + TRANSPORT_NS
+        self.delay_ns = self.period_ns + 1_000_000  # of a command, from here to the controller
         self.intake, self.arrived_ns = Intake(), 0
         self._bridge: _Process | None = None
         self._driving, self._fault = False, ""
-
-    @property
-    def bridge_pid(self) -> int | None:
-        """Process id of the bridge; None when not connected."""
-        return None if self._bridge is None else self._bridge.pid
 
     def connect(self) -> None:
         """Start the bridge and wait until it hears the arm. Raises DriverError."""

@@ -40,7 +40,6 @@ SEEN_S, MEASURED = 1.0, 20  # at least, before others are judged; messages that 
 BLIND_S = 0.005  # without a state, of an arm that is braked: its speed is not known any more
 SILENCE_S = 0.05  # without a command, of an arm that is driven
 HELD_S = 10.0  # that an arm is held for which nobody asks any more
-LOOK_S = 0.25  # between two looks at who else commands
 FASTEST, JUMP_RAD = 30.0, 0.05  # rad/s, rad: no joint is further on than that
 JUMPS = 20  # in a row are no disturbance: the arm is somewhere else
 RATE_SHARE = 0.1
@@ -347,7 +346,7 @@ class Bridge:
         if memory.words.doing in BRAKES and now - self._heard > BLIND_S:
             self._send(self._braker.blind())
         if self._commands is not None and now > self._look_at:
-            self._look_at = now + LOOK_S
+            self._look_at = now + 0.25  # between two looks at who else commands
             if doing == Doing.DRIVING and self._others(self._commands):
                 topic = self._where.command
                 self._take_over(f"somebody else began to publish on {topic}")

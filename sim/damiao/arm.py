@@ -9,6 +9,7 @@ reached, linearly, at that tick's end: the torque is continuous, as in `sim.plan
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class World:
         self.slipped_ns = self.ticks = self.limp_ticks = self.stop_ticks = 0
         self.fastest = 0.0
         self._noise: SensorNoise | None = None
-        if any(np.any(value) for value in levels.as_dict().values()):
+        if any(np.any(value) for value in asdict(levels).values()):
             self._noise = SensorNoise(levels, truth.n, seed)
         zero = np.zeros(truth.n)
         self._quiet = JointSample(0, zero, zero, zero)

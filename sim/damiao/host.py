@@ -5,46 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import can
+from can.interfaces.virtual import VirtualBus
 
 from drivers.interface import Driver, JointSample, PassedOn
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario
 
 
-class ServedBus(can.BusABC):
-    """A host's bus whose boards live in the same process: whoever receives lets them work.
-
-    Everything else goes straight through; closing closes the bus inside as well.
+class ServedBus(VirtualBus):
+    """A host's end of a virtual bus whose boards live in the same process.
 
     Attributes:
-        serving: whether to do so; without it the boards' owner calls `Boards.service`.
+        serving: whoever receives lets the boards work; without it their owner calls
+            `Boards.service`.
     """
 
-    def __init__(self, bus: can.BusABC, boards: Boards) -> None:
-        """Wrap the host's end of a bus."""
-        self._bus, self._boards, self.serving = bus, boards, True
-        self._can_protocol = bus.protocol
-        self.channel_info = bus.channel_info
-        super().__init__(channel=0)
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send."""
-        self._bus.send(msg, timeout)
+    def __init__(self, channel: str, boards: Boards) -> None:
+        """Join the boards' channel."""
+        super().__init__(channel)
+        self._boards, self.serving = boards, True
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Let the boards work, then receive."""
         if self.serving:
             self._boards.service()
-        return self._bus.recv(timeout)
-
-    def fileno(self) -> int:
-        """Of the bus inside."""
-        return self._bus.fileno()
-
-    def shutdown(self) -> None:
-        """Close."""
-        super().shutdown()
-        self._bus.shutdown()
+        return super().recv(timeout)
 
 
 class InProcess(PassedOn):
@@ -66,8 +51,7 @@ class InProcess(PassedOn):
     ) -> None:
         self._far = can.Bus(interface="virtual", channel=channel)
         self._boards = Boards(self._far, scenario)
-        near = can.Bus(interface="virtual", channel=channel)
-        self._bus = ServedBus(near, self._boards)
+        self._bus = ServedBus(channel, self._boards)
         super().__init__(make(self._bus))
         self.plant_time_ns = 0
         self._closed = False

@@ -1,8 +1,9 @@
 """A CAN line in virtual time: a host and the boards in lockstep, faster than the clock.
 
-Every frame takes the time of its bits, stuff bits included. When the line is free the frame with
-the lowest id goes first, out of the oldest of the host and all those of the motors: at 1 kHz the
-seven commands come first, then the seven replies. Motors measure when their command has arrived.
+Every frame takes the time of its bits, usual stuff bits included. When the line is free the frame
+with the lowest id goes first, out of the oldest of the host and all those of the motors: at 1 kHz
+the seven commands come first, then the seven replies. Motors measure when their command has
+arrived.
 
 A loop at 1 kHz, here of a driver that takes a bus and a clock; `boards.world` knows the truth:
 
@@ -30,11 +31,9 @@ import heapq
 from collections import deque
 from collections.abc import Iterator
 from copy import copy
-from functools import lru_cache
 from typing import Protocol
 
 import can
-from can.util import dlc2len, len2dlc
 
 from sim.faults import Faults
 
@@ -44,87 +43,20 @@ START_NS = 1_000_000_000
 FAR_NS = 1 << 62
 
 ERROR_FRAME_BITS = 23  # flag 6, echo of the others up to 6, delimiter 8, gap 3
-CLASSIC_TAIL_BITS = 13  # checksum delimiter, acknowledge and its delimiter, end 7, gap 3
-FD_TAIL_BITS = 12  # the same without the checksum delimiter, which is sent at the data rate
-CRC15 = 0x4599
-SHORT_CRC_BYTES = 16  # FD frames of more bytes have a checksum of 21 bits instead of 17
-
-State = tuple[int, int]  # last bit (-1 before any), length of its run
+FD_SLOW_BITS = 30  # outside of what a bit-rate switch speeds up, with one stuff bit
+STUFFED = 0.084  # stuff bits for each bit that may need one, on average over commands and replies
 
 
-@lru_cache(maxsize=1 << 16)
-def stuffed(bits: int, width: int, state: State) -> tuple[int, State]:
-    """Stuff bits that `width` bits get after what `state` tells, and the state after them.
-
-    A stuff bit is counted with the bit that it precedes.
-    """
-    last, run = state
-    count = 0
-    for k in range(width - 1, -1, -1):
-        bit = bits >> k & 1
-        if run == 5:
-            count, last, run = count + 1, 1 - last, 1
-        run = run + 1 if bit == last else 1
-        last = bit
-    return count, (last, run)
-
-
-def frame_ns(message: can.Message, bitrate: int, data_bitrate: int) -> int:
-    """Time from start of frame to the end of the gap after it, ns, to the bit (ISO 11898-1).
-
-    A frame of equal bits in a row gets a stuff bit after every fifth. Classic: everything from
-    start of frame to checksum is stuffed. FD: up to the last data bit; the checksum field has
-    fixed ones.
-
-    Args:
-        message: 11-bit data frame or error frame.
-        bitrate: bit/s, of arbitration and of classic frames.
-        data_bitrate: bit/s, of the data of an FD frame with bit-rate switch.
-    """
+def frame_ns(message: can.Message) -> int:
+    """Typical time of an 11-bit frame, 16 bytes or less, and the gap after it, ns (ISO 11898-1)."""
     if message.is_error_frame:
-        return round(ERROR_FRAME_BITS * 1e9 / bitrate)
+        return round(ERROR_FRAME_BITS * 1e9 / BITRATE)
+    data = 8 * len(message.data)
     if not message.is_fd:
-        return round(classic_bits(message.arbitration_id, bytes(message.data)) * 1e9 / bitrate)
-    slow, fast = fd_bits(message.arbitration_id, bytes(message.data), message.bitrate_switch)
-    return round(slow * 1e9 / bitrate + fast * 1e9 / data_bitrate)
-
-
-def classic_bits(identifier: int, data: bytes) -> int:
-    """Bits of a classic frame, stuff bits and gap included."""
-    head = identifier << 7 | len(data)  # start, id, then three dominant bits and the length
-    parts = [(head, 19), *((byte, 8) for byte in data)]
-    crc, count, state = 0, 0, (-1, 0)
-    for bits, width in parts:
-        crc = _crc_of(bits, width, crc)
-    for bits, width in (*parts, (crc, 15)):
-        more, state = stuffed(bits, width, state)
-        count += more
-    return 19 + 8 * len(data) + 15 + count + (state[1] == 5) + CLASSIC_TAIL_BITS
-
-
-def fd_bits(identifier: int, data: bytes, switch: bool) -> tuple[int, int]:
-    """Bits of an FD frame at the arbitration rate and at the data rate, gap included."""
-    # Start, id, two dominant bits (RRS, IDE), FDF, a dominant one (res), BRS.
-    slow, state = stuffed(identifier << 5 | 0b00100 | switch, 17, (-1, 0))
-    code = len2dlc(len(data))
-    size = dlc2len(code)
-    fast, state = stuffed(code, 5, state)  # ESI and length code
-    for byte in data.ljust(size, b"\0"):
-        more, state = stuffed(byte, 8, state)
-        fast += more
-    checksum = 4 + (17 if size <= SHORT_CRC_BYTES else 21)  # with the stuff count
-    fixed = 1 + checksum // 4
-    slow, fast = slow + 17 + FD_TAIL_BITS, fast + 5 + 8 * size + checksum + fixed + 1
-    return (slow, fast) if switch else (slow + fast, 0)
-
-
-@lru_cache(maxsize=1 << 18)
-def _crc_of(bits: int, width: int, crc: int) -> int:
-    """Checksum of a classic frame with `width` bits more."""
-    for k in range(width - 1, -1, -1):
-        invert = (bits >> k & 1) ^ (crc >> 14)
-        crc = (crc << 1 & 0x7FFF) ^ (CRC15 if invert else 0)
-    return crc
+        return round((47 + data + STUFFED * (34 + data)) * 1e9 / BITRATE)
+    # From ESI to the checksum, which has stuff bits at fixed places, a switched frame is faster.
+    fast = DATA_BITRATE if message.bitrate_switch else BITRATE
+    return round((FD_SLOW_BITS / BITRATE + (33 + data + STUFFED * (5 + data)) / fast) * 1e9)
 
 
 class Node(Protocol):
@@ -200,10 +132,6 @@ class Line:
         """Let `node` handle what arrives at the motors' end."""
         self._node = node
 
-    def advance_to(self, until_ns: int) -> None:
-        """Let everything happen that is due by an instant, which becomes the present."""
-        self._run(until_ns, None)
-
     def next_whole_ns(self, period_ns: int) -> int:
         """The next instant, from now on, that is whole periods after the start."""
         return self.start_ns + -((self.start_ns - self._now_ns) // period_ns) * period_ns
@@ -224,9 +152,9 @@ class Line:
         """
         if self._eager and end is self.host:
             while not end.arrived and self._next_event() < FAR_NS:
-                self._run(self._next_event(), end)
+                self.advance_to(self._next_event(), end)
         if for_ns and not end.arrived:
-            self._run(self._now_ns + for_ns, end)
+            self.advance_to(self._now_ns + for_ns, end)
 
     def queue(self, end: LineEnd, message: can.Message) -> None:
         """Take a frame to be sent. Raises CanOperationError."""
@@ -246,7 +174,8 @@ class Line:
         own.is_rx = True
         self._from_host.append((self._now_ns, own))
 
-    def _run(self, until_ns: int, awaited: LineEnd | None) -> None:
+    def advance_to(self, until_ns: int, awaited: LineEnd | None = None) -> None:
+        """Let what is due by an instant, the new present, happen; until `awaited` gets a frame."""
         while awaited is None or not awaited.arrived:
             if self._flying is not None:
                 if self._flying[0] > until_ns:
@@ -291,7 +220,7 @@ class Line:
         else:
             message, to = waiting.pop(index)[3], self.host
             heapq.heapify(waiting)
-        took = frame_ns(message, BITRATE, DATA_BITRATE)
+        took = frame_ns(message)
         self._flying = now + took, to, message
 
     def _land(self, end_ns: int, to: LineEnd, message: can.Message) -> None:

@@ -32,8 +32,6 @@ from sim.truth import Array
 
 IDLE_S = 5e-3  # longest wait without frames: the arm goes on in steps of this
 ACTIVE_NS = 10_000_000  # so long after a frame the ticks keep their rhythm
-FIFO_PRIORITY = 40
-MOST_UNREADABLE = 1000  # failures to receive in a row, then the bus counts as gone
 REPLY_OFFSET = 0x10  # reply id = command id + 0x10, as OpenArm sets it
 WARM_UP_TICKS = 20  # temperatures are slow: they move on every 20 ms
 
@@ -264,7 +262,7 @@ class Boards:
         Asks for SCHED_FIFO and goes on without where that is not permitted.
         """
         with contextlib.suppress(OSError, AttributeError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))
         while not stop():
             message = self._receive(self._patience_s())
             begun = time.perf_counter_ns()
@@ -305,7 +303,7 @@ class Boards:
 
         Raises can.CanError where the bus itself is gone.
         """
-        for _ in range(MOST_UNREADABLE):
+        for _ in range(1000):  # failures to receive in a row, then the bus counts as gone
             try:
                 return self._bus.recv(patience_s)
             except can.CanError:

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -26,7 +26,7 @@ import numpy as np
 import pybullet as bullet
 
 from sim.falls import fall
-from sim.falls.fall import RATE_HZ, FallRecord, TreeLimits, TreeTruth, babble
+from sim.falls.fall import RATE_HZ, FallRecord, TreeTruth, babble
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
@@ -36,7 +36,6 @@ FORMAT = 1  # of the files; a new one whenever what they hold is computed otherw
 CACHE_VARIABLE = "PANDA_ADAPTER_CACHE"  # environment variable, folder
 SIGNALS = tuple(item.name for item in fields(FallRecord))
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-SHUTDOWN_S = 10.0  # that a worker has left once it is asked to end
 MOTION, NOISE = 1, 2  # streams of random numbers
 
 # What the sensors add; all noise is white and Gaussian, of units up to half the sample rate.
@@ -166,9 +165,6 @@ class FallData:
     def __len__(self) -> int:
         return len(self.jobs)
 
-    def __iter__(self) -> Iterator[dict[str, Array]]:
-        return (self[k] for k in range(len(self)))
-
     def __getitem__(self, k: int) -> dict[str, Array]:
         record = self.exact(k)
         if not self.noise:
@@ -243,7 +239,7 @@ def _key(truth: TreeTruth, flight: Flight) -> str:
         "format": FORMAT,
         "simulator": bullet.getAPIVersion(),
         "tree": [truth.parent, *(x.tolist() for x in (truth.R, truth.p, truth.theta))],
-        "limits": {k: getattr(truth.limits, k).tolist() for k in TreeLimits.__slots__},
+        "limits": {k: getattr(truth.limits, k).tolist() for k in fall.BOUNDS},
         "gravity": truth.gravity.tolist(),
         "feedback": [fall.BANDWIDTH, fall.DAMPING],
         "babbling": {
@@ -282,28 +278,17 @@ def _make(jobs: list[_Job], processes: int) -> None:
         return
     command = [sys.executable, "-P", "-c", f"from {__name__} import work; work()"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
-    workers = [
-        subprocess.Popen(
-            command, env=environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
+
+    def run(share: list[_Job]) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.run(
+            command, env=environment, input=pickle.dumps(share), capture_output=True
         )
-        for _ in range(count)
-    ]  # fmt: skip
-    try:
-        for k, worker in enumerate(workers):
-            assert worker.stdin is not None
-            with contextlib.suppress(BrokenPipeError), worker.stdin as pipe:
-                pickle.dump(jobs[k::count], pipe)
-            worker.stdin = None
-        said = [worker.communicate()[1].decode(errors="replace") for worker in workers]
-    finally:
-        for worker in workers:
-            if worker.poll() is None:
-                worker.terminate()
-                worker.wait(SHUTDOWN_S)
-    for worker, text in zip(workers, said, strict=True):
-        if worker.returncode:
-            raise RuntimeError(f"a worker ended with {worker.returncode}: {text.strip()}")
+
+    with ThreadPoolExecutor(count) as pool:
+        for worker in pool.map(run, [jobs[k::count] for k in range(count)]):
+            if worker.returncode:
+                said = worker.stderr.decode(errors="replace").strip()
+                raise RuntimeError(f"a worker ended with {worker.returncode}: {said}")
 
 
 def work() -> None:

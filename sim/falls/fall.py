@@ -18,20 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from sim.dynamics import Frames, compiled, link_motion
 from sim.rigid_bodies import disconnect, load_urdf
-from sim.truth import Array, body_of, facts_of, from_rpy, lam_of, theta_of
+from sim.truth import Array, Limits, body_of, facts_of, from_rpy, lam_of, theta_of
 from sim.urdf_writer import joint_text, link_text, principal
 
 BASE = -1
-
-
-@dataclass(frozen=True, slots=True)
-class TreeLimits:
-    """Joint limits, (n,) each: rad, rad, rad/s, N m."""
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    effort: Array
+BOUNDS = ("lower", "upper", "velocity", "effort")  # of a joint, as its facts name them
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +39,7 @@ class TreeTruth:
         p: (n, 3) its position there, m.
         theta: (n + 1, 10) [m mX mY mZ XX XY XZ YY YZ ZZ] about the link-frame origin, SI; the
             base first.
-        limits: of the joints.
+        limits: of the joints; none of their acceleration.
         gravity: (3,) acceleration of gravity in world axes, m/s².
 
     Raises:
@@ -63,7 +54,7 @@ class TreeTruth:
     R: Array
     p: Array
     theta: Array
-    limits: TreeLimits
+    limits: Limits
     gravity: Array
 
     def __post_init__(self) -> None:
@@ -103,7 +94,11 @@ def atlas() -> TreeTruth:
         R=np.array([from_rpy(j["rpy"]) for j in joints]),
         p=np.array([j["xyz"] for j in joints]),
         theta=np.array([theta_of(x["mass"], x["com"], x["inertia"]) for x in (base, *joints)]),
-        limits=TreeLimits(*(np.array([j[k] for j in joints]) for k in TreeLimits.__slots__)),
+        limits=Limits(
+            **{key: np.array([j[key] for j in joints]) for key in BOUNDS},
+            acceleration=np.full(len(joints), np.inf),
+            slowing=None,
+        ),
         gravity=np.array(facts["robot"]["gravity"]),
     )
 
@@ -123,7 +118,7 @@ TOP_SPEED, SPEED_SHARE = 4.0, 0.5
 TUMBLE = 0.3  # rms angular velocity of the base at the start, rad/s per axis
 
 
-def plan(limits: TreeLimits, t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def plan(limits: Limits, t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Wanted positions and velocities of all joints.
 
     Args:

@@ -143,6 +143,7 @@ class Arm:
 
     Attributes:
         truth: what the internal model knows.
+        plant: the true arm.
         sample: the last sample of the sensors.
         q, dq: (7,) the true joint state at that instant, rad, rad/s.
         tau_external: (7,) low-passed measured minus model torque, N m: positive for what the
@@ -155,11 +156,11 @@ class Arm:
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         self.truth = scenario.truth.with_changes(effects=())  # all that the robot knows
         self._motors = scenario.truth.motor_inertia
-        self._plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
+        self.plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
         self._n = self.truth.n
         self._still = np.zeros(self._n)
         self.refresh(settings)
-        self.sample: JointSample = self._plant.read()
+        self.sample: JointSample = self.plant.read()
         self.q, self.dq, self._drive = self._state()
         self.tau_external: Array = np.zeros(self._n)
         self.wrench: Array = np.zeros(6)
@@ -168,11 +169,6 @@ class Arm:
         self.mass(self.q)
         self.reach(self.q, self.pose, np.nan)
         self._spring(self.pose, np.zeros(6), np.ones(6))
-
-    @property
-    def saturated(self) -> bool:
-        """The last drive asked for more than a joint can give."""
-        return self._plant.saturated
 
     @property
     def outside(self) -> bool:
@@ -193,9 +189,9 @@ class Arm:
         """Torques on top of gravity, reached at the end of the next tick; brakes open."""
         wanted = tau + self.model(self.q, self._still, self._still)
         try:
-            self._plant.command(wanted)
+            self.plant.command(wanted)
         except DriverError:  # the plant's own guard: a joint is out of range or too fast
-            self._plant.stop()
+            self.plant.stop()
 
     def track(self, q: Array, dq: Array, ddq: Array, stiffness: Array) -> None:
         """Follow a joint motion by impedance control: no steady error without external torque."""
@@ -225,21 +221,17 @@ class Arm:
         M = self.mass(self.q)
         return impedance(M, self.jacobian, error, rate, stiffness, FASTEST_RATE)
 
-    def brake(self) -> None:
-        """Slow down and hold."""
-        self._plant.stop()
-
     def release(self) -> bool:
         """Let the drives act again after a violation; False while a joint is out of its range."""
         if self.outside:
             return False
-        self._plant.fault = None
+        self.plant.fault = None
         return True
 
     def step(self) -> None:
         """One tick of the world; then look at the sensors."""
         q, dq, drive = self.q, self.dq, self._drive
-        self.sample = self._plant.read()
+        self.sample = self.plant.read()
         self.q, self.dq, self._drive = self._state()
         middle = (q + self.q) / 2, (dq + self.dq) / 2, (self.dq - dq) / TICK_S
         sensed = self.sample.tau + (drive - self._drive) / 2  # brought to the tick's middle
@@ -268,13 +260,9 @@ class Arm:
         """
         return posture(self.truth.frames, self._tool, q, np.ascontiguousarray(pose), elbow)
 
-    def close(self) -> None:
-        """Free the simulator."""
-        self._plant.close()
-
     def _state(self) -> tuple[Array, Array, Array]:
         """True q, dq and driving torque, each in one piece of memory: one compiled variant."""
-        q, dq, drive = self._plant.link_state()
+        q, dq, drive = self.plant.link_state()
         return np.ascontiguousarray(q), np.ascontiguousarray(dq), drive
 
     def _look(self) -> None:

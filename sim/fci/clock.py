@@ -8,15 +8,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
+from drivers.process import sleep_until
+
 PERIOD_NS = 1_000_000
 ANSWER_NS = 500_000  # a client's own part of a period (Franka FCI documentation)
 SPIN_NS = 60_000  # waiting actively for the last part: a wake-up costs the system that much
 PRIORITY = 80  # of SCHED_FIFO: above any client loop but those that take 99
-
-
-def _sleep_to(deadline_ns: int) -> None:
-    """Sleep until CLOCK_MONOTONIC shows the deadline."""
-    time.sleep(max(1e-9 * (deadline_ns - time.monotonic_ns()), 0.0))
 
 
 class Ticks:
@@ -27,7 +24,7 @@ class Ticks:
     """
 
     def __init__(
-        self, now: Callable[[], int] = time.monotonic_ns, sleep: Callable[[int], None] = _sleep_to
+        self, now: Callable[[], int] = time.monotonic_ns, sleep: Callable[[int], None] = sleep_until
     ) -> None:
         self._now, self._sleep = now, sleep
         self._due = self._slipped = 0

@@ -93,7 +93,7 @@ SIZES = {
     "LoadModelLibrary": 2, "GetRobotModel": 0,
 }  # fmt: skip
 MOVE_BYTES_10 = 113
-_LIMIT_REPLY = 153  # bytes of GetCartesianLimit's reply between status and its last byte, with it
+LIMIT_REPLY = 153  # zero bytes after the status in GetCartesianLimit's reply: no limit is active
 
 
 class RobotMode(IntEnum):
@@ -344,8 +344,3 @@ def reply(request: Request, status: Status, version: int, rest: bytes = b"") -> 
     code = code_of(request.name, status, version)
     size = HEADER.size + 1 + len(rest)
     return HEADER.pack(request.number, request.ident, size) + bytes((code,)) + rest
-
-
-def limit_reply(request: Request, version: int) -> bytes:
-    """The reply to GetCartesianLimit: a limit that is not active."""
-    return reply(request, Status.OK, version, bytes(_LIMIT_REPLY))

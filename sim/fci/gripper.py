@@ -18,10 +18,8 @@ VERSION = 3
 HEADER = struct.Struct("<HII")  # command, command id, size with this header
 STATE = struct.Struct("<IddBH")  # id, width and greatest width (m), grasped, temperature
 PAYLOADS = {0: "<HH", 1: "", 2: "<5d", 3: "<2d", 4: ""}  # by command
-STATE_PERIOD_S = 0.01  # chosen; the hand's own is not published
 WIDEST = 0.08  # m between the fingers
 HOMING_SPEED, FASTEST = 0.05, 0.1  # m/s; the first chosen, the second of the data sheet
-STRONGEST = 140.0  # N, data sheet
 NOTHING = 0.0  # m, the width of what lies between the fingers where nothing does
 
 
@@ -80,7 +78,7 @@ class Fingers:
         self.grasped = False
         if command == Command.GRASP:
             inner, outer, force = numbers[1], numbers[2], numbers[4]
-            if not (inner >= 0.0 and outer >= 0.0 and 0.0 < force <= STRONGEST):
+            if not (inner >= 0.0 and outer >= 0.0 and 0.0 < force <= 140.0):  # N, data sheet
                 return False
             self._accepted = width - inner, width + outer
             width = NOTHING if self.width >= width else WIDEST
@@ -157,7 +155,7 @@ class GripperServer:
         else:
             self._listen()
         if self._states_to is not None and now_s >= self._due_s:
-            self._due_s = now_s + STATE_PERIOD_S
+            self._due_s = now_s + 0.01  # chosen; the hand's own is not published
             self._message_id += 1
             hand = self.fingers
             state = (self._message_id, hand.width, WIDEST, hand.grasped, 30)  # °C

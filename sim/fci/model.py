@@ -1,6 +1,6 @@
 """The arm as its clients get it: a model library in protocol 5, URDF in protocol 10.
 
-The library's source is C with one arm's numbers, built once with the machine's own compiler. It has
+The library's source is C with one arm's numbers, built with the machine's own compiler. It has
 thirty functions by name (libfranka 0.9.2): `Ji_J_Jk` and `O_J_Jk`, Jacobians in the frame's own and
 in base axes; `O_T_Jk`, poses; k = 1..7 joints, 8 flange, 9 end effector; `M_NE`, `c_NE`, `g_NE`,
 mass matrix, Coriolis and gravity torques with a load. Matrices are column-major.
@@ -12,13 +12,12 @@ each with its limits and with `position_based_velocity_limits`, and a link that 
 
 from __future__ import annotations
 
-import hashlib
-import os
 import platform
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -67,38 +66,27 @@ def _frames() -> list[str]:
 
 def model_library(truth: Truth) -> bytes | None:
     """The library's bytes; None without a C compiler, or where it does not build for x64 Linux."""
+    return _built(model_source(truth))
+
+
+@cache
+def _built(source: str) -> bytes | None:
     compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     if compiler is None or (platform.system(), platform.machine()) != ("Linux", "x86_64"):
         return None
-    source = model_source(truth)
-    key = hashlib.sha256("\n".join((compiler, *OPTIONS, source)).encode()).hexdigest()
-    folder = _cache_folder()
-    kept = folder / f"{key}.so"
-    if not kept.is_file():
-        with tempfile.TemporaryDirectory(dir=folder) as work:
-            built = Path(work) / "model.so"
-            try:
-                subprocess.run(
-                    [compiler, *OPTIONS, "-o", str(built)],
-                    input=source.encode(),
-                    capture_output=True,
-                    timeout=TIMEOUT_S,
-                    check=True,
-                )
-            except (OSError, subprocess.SubprocessError):
-                return None
-            built.replace(kept)
-    return kept.read_bytes()
-
-
-def _cache_folder() -> Path:
-    """A folder of this user alone: what is in it will be run by clients."""
-    folder = Path(tempfile.gettempdir()) / f"simulated-fci-models-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    facts = folder.lstat()
-    if folder.is_symlink() or facts.st_uid != os.getuid() or facts.st_mode & 0o077:
-        return Path(tempfile.mkdtemp(prefix="simulated-fci-models-"))
-    return folder
+    with tempfile.TemporaryDirectory() as work:
+        built = Path(work) / "model.so"
+        try:
+            subprocess.run(
+                [compiler, *OPTIONS, "-o", str(built)],
+                input=source.encode(),
+                capture_output=True,
+                timeout=TIMEOUT_S,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return built.read_bytes()
 
 
 def robot_urdf(truth: Truth) -> str:

@@ -11,7 +11,6 @@ from sim.truth import Array, Limits
 
 START_TOLERANCE = 1e-3  # rad, first position from q_d; the robot's own is not published
 WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
-MOST_MISSED = 20  # in a row, then communication_constraints_violation
 # Until the first command the client still changes over from replies to states. Chosen here: longer
 # than 20 ms, since a client on a machine without real-time kernel may be held up just then.
 FIRST_COMMAND_TICKS = 200
@@ -134,7 +133,7 @@ class CommandedMotion:
             return COMMUNICATION if self._before >= FIRST_COMMAND_TICKS else None
         self._note(False)
         self._missed += 1
-        if self._missed >= MOST_MISSED:
+        if self._missed >= 20:  # in a row, then communication_constraints_violation
             return COMMUNICATION
         if self.generator != Generator.NONE:
             self.path.extrapolate()

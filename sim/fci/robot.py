@@ -211,7 +211,7 @@ class Robot:
         near_end = (arm.dq < slowest - STANDING) | (arm.dq > fastest + STANDING)
         if (near_end | (np.abs(arm.dq) > arm.truth.limits.velocity)).any():
             found.append("joint_velocity_violation")
-        if arm.saturated:
+        if arm.plant.saturated:
             found.append("tau_J_range_violation")
         hit = np.abs(arm.tau_external) > settings.upper_torque
         if hit.any():
@@ -226,7 +226,7 @@ class Robot:
 
     def _end(self, status: Status) -> None:
         """Brake; the motion's second reply goes out after the next state."""
-        self.arm.brake()
+        self.arm.plant.stop()
         self.tau_desired = np.zeros(self.arm.truth.n)
         if self.motion is None:
             return

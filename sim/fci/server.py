@@ -17,6 +17,7 @@ from sim.fci.clock import Ticks, undisturbed
 from sim.fci.codec import (
     COMMAND_BYTES,
     HOST,
+    LIMIT_REPLY,
     PORT,
     TICK_S,
     VERSIONS,
@@ -25,7 +26,6 @@ from sim.fci.codec import (
     RequestReader,
     RobotCommand,
     Status,
-    limit_reply,
     read_command,
     reply,
 )
@@ -41,7 +41,6 @@ CHUNK = 4096  # bytes at a time; the longest request has 428
 MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it is dropped
 QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
 IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
-IDLE_WITH_HAND_S = 0.01
 
 
 class ClientSession:
@@ -239,7 +238,7 @@ class FciServer:
             self._ticks.restart()
             while not stop():
                 if self._session is None and not self.robot.moving:
-                    wait_s = IDLE_S if self.hand is None else IDLE_WITH_HAND_S
+                    wait_s = IDLE_S if self.hand is None else 0.01
                     select.select([self._listener], [], [], wait_s)
                     self._ticks.restart()
                     if self.hand is not None:
@@ -280,7 +279,7 @@ class FciServer:
         self._listener.close()
         if self.hand is not None:
             self.hand.close()
-        self.robot.arm.close()
+        self.robot.arm.plant.close()
 
     def _answer_to_state(self, session: ClientSession) -> RobotCommand | None:
         """The client's command of this tick; the world slips while one that is owed is late."""
@@ -372,7 +371,7 @@ class FciServer:
         if not session.connected:
             raise BadRequest(f"{request.name} before Connect")
         if request.name == "GetCartesianLimit":
-            return limit_reply(request, version)
+            return reply(request, Status.OK, version, bytes(LIMIT_REPLY))
         if request.name in ("LoadModelLibrary", "GetRobotModel"):
             strange = request.name == "LoadModelLibrary" and request.payload != b"\0\0"
             if self._model is None or strange:

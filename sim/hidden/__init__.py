@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sim.hidden.record import pybullet_recording, simulate, write, write_files
-from sim.hidden.trial import KINDS, SHARES, Trial, draw, nominal_urdf, seal, unseal
+from sim.hidden.trial import KINDS, SHARES, Trial, draw, nominal_urdf
 
 __all__ = [
     "KINDS",
@@ -12,9 +12,7 @@ __all__ = [
     "draw",
     "nominal_urdf",
     "pybullet_recording",
-    "seal",
     "simulate",
-    "unseal",
     "write",
     "write_files",
 ]

@@ -56,10 +56,6 @@ class DrawnMotion:
         moves = (inside == t)[:, None]
         return q, moves * dq, moves * ddq
 
-    def as_dict(self) -> dict[str, object]:
-        """What a truth file says of it."""
-        return {"kind": self.kind, "slow": self.slow, "middle": self.middle.tolist()}
-
 
 def draw_motion(
     rng: np.random.Generator,

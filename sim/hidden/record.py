@@ -6,6 +6,7 @@ feedback of the links' true motion, so that no sensor effect shakes the arm.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.files.mcap import Commands, Log, write_log
 from drivers.interface import JointSample
-from sim.hidden.trial import Trial, nominal_urdf, seal
+from sim.hidden.trial import Trial, nominal_urdf
 from sim.noise import SensorNoise, levels_of
 from sim.plant import PERIOD_NS, Plant
 from sim.truth import Array
@@ -96,7 +97,7 @@ def log_of(
 def write(
     trial: Trial, folder: Path | str, recording: Log | None = None, simulator: str = "pybullet"
 ) -> tuple[Path, Path, Path]:
-    """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths.
+    """Write recording.mcap, nominal.urdf and truth.json; returns their paths.
 
     Args:
         trial: as drawn.
@@ -117,5 +118,5 @@ def write_files(
     paths = folder / "recording.mcap", folder / "nominal.urdf", folder / "truth.json"
     write_log(recording, paths[0], {})
     paths[1].write_text(model, "utf-8")
-    paths[2].write_text(seal(truth), "utf-8")
+    paths[2].write_text(json.dumps(truth), "utf-8")
     return paths

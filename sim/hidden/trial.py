@@ -8,10 +8,7 @@ friction to follow a law of its own.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +33,6 @@ from sim.noise_levels import NoiseLevels
 from sim.truth import ATTEMPTS, Array, Truth, panda, wrong_bodies
 from sim.urdf_writer import urdf
 
-FORMAT, VERSION = "panda-adapter/hidden-truth", 1
 KINDS = ("null", "single", "pair", "outside")
 SHARES = (0.25, 0.40, 0.25, 0.10)
 MODEL_ERROR = (0.005, 0.05)  # rms error of the nominal model's inertial numbers, of their sizes
@@ -115,26 +111,12 @@ class Trial:
         return self.disturbance_nm * first_order(rng.standard_normal((m, n)), keep)
 
     def as_dict(self) -> dict[str, Any]:
-        """What a truth file holds: enough to know, simulate and score the trial."""
-        arm = self.arm.as_dict()
+        """What a truth file holds: enough to score the trial."""
         return {
-            "format": FORMAT,
-            "version": VERSION,
             "seed": self.seed,
             "kind": self.kind,
             "effects": [effect.as_dict() for effect in self.effects],
             "rubs": [] if self.friction is None else list(RUBS),
-            "model_error": self.model_error,
-            "seconds": self.seconds,
-            "commands": self.commands,
-            "motion": self.motion.as_dict(),
-            "disturbance": {"rms_nm": self.disturbance_nm.tolist(), "hz": self.disturbance_hz},
-            "noise": self.noise.as_dict(),
-            "joints": arm["joints"],
-            "lambda": arm["lambda"],
-            "gravity": arm["gravity"],
-            "theta": arm["theta"],
-            "nominal_theta": self.nominal.theta.tolist(),
         }
 
 
@@ -239,21 +221,3 @@ def first_order(white: Array, keep: float) -> Array:
 def nominal_urdf(nominal: Truth) -> str:
     """The nominal model as URDF text with the joints' limits."""
     return urdf(nominal, limited=True)
-
-
-def seal(contents: dict[str, Any]) -> str:
-    """Text of a truth file: its contents and their SHA-256, so that a change shows."""
-    return json.dumps({"sha256": _digest(contents), "truth": contents}) + "\n"
-
-
-def _digest(contents: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
-
-
-def unseal(path: Path | str) -> dict[str, Any]:
-    """Contents of a sealed truth file. Raises ValueError if they were changed."""
-    outer = json.loads(Path(path).read_text("utf-8"))
-    contents: dict[str, Any] = outer["truth"]
-    if _digest(contents) != outer["sha256"]:
-        raise ValueError(f"{path}: the truth was changed after it was sealed")
-    return contents

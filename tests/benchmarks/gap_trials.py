@@ -1,7 +1,7 @@
 """Hidden-effect trials of `adapter gap`: draw, record, find the gap, score. `make trials`.
 
-The workflow sees a folder with the recording and the nominal model; the truth lies elsewhere,
-sealed, and is opened after it has answered.
+The workflow sees a folder with the recording and the nominal model; the truth lies elsewhere
+and is opened after it has answered.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.files.mcap import Log
-from sim.hidden import Trial, draw, unseal
+from sim.hidden import Trial, draw
 from sim.hidden.motion import KINDS
 from sim.hidden.record import pybullet_recording, write
 from tests.helpers.benchmark import in_processes, options
@@ -55,7 +55,7 @@ def run_trial(trial: Trial, simulator: str, find_gap: Analyse, judges: Sequence[
         answer = find_gap([log], model, model_out=shown / "model.json")
         seconds = time.perf_counter() - begun
         result: dict[str, Any] = answer if isinstance(answer, dict) else answer.as_dict()
-        row = score_trial(result, unseal(truth), detectability(trial))
+        row = score_trial(result, json.loads(truth.read_text()), detectability(trial))
         for judge in judges:
             row.update(judge(trial, recording, result, shown))
     row["slow"], row["motion"], row["seconds"] = trial.motion.slow, trial.motion.kind, seconds

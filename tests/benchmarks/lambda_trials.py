@@ -18,6 +18,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from adapter.model.urdf import read_urdf
 from adapter.physics.identifiability import random_motion
 from adapter.physics.kernels import Frames, base_at_rest, frames_of, link_motions, placed
 from adapter.signals.front_end import FrontEnd
-from tests.helpers.benchmark import Row, options, write
+from tests.helpers.benchmark import Row, options, shown, told, write
 from tests.helpers.random_trees import cad_tree
 
 ARMS = {
@@ -184,12 +185,9 @@ def _trials(pool: ProcessPoolExecutor, kind: str, args: argparse.Namespace) -> l
     if kind == "arms" and robots_folder() is None:
         print(NO_ARMS)
         return []
-    rows: list[Row] = []
-    for found in pool.map(partial(KINDS[kind], seeds=args.seeds), jobs):
-        rows += found
-        for row in found:
-            parts = (f"{v:.3g}" if isinstance(v, float) else v for v in row.values())
-            print(*(f"{k}={v}" for k, v in zip(row, parts, strict=True)), flush=True)
+    rows = told(
+        chain.from_iterable(pool.map(partial(KINDS[kind], seeds=args.seeds), jobs)), line=shown
+    )
     print(f"{kind}: {sum(row['failed'] for row in rows)} of {len(rows)} failed", flush=True)
     return rows
 

@@ -8,7 +8,6 @@ account of every sample and the run's own figures.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import re
@@ -19,6 +18,8 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from tests.helpers.benchmark import options, write
 
 EVERY_S, SETTLED_S = 5.0, 60.0
 SHORTEST_S = 30.0  # of a run that is begun again
@@ -136,11 +137,8 @@ def one_run(address: str, minutes: float, folder: Path) -> tuple[int, dict[str, 
 
 def main() -> None:
     """Run, watch, print. An arm that tripped is run again until the time is over."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser = options(__doc__, minutes=10.0, faults=0.0)
     parser.add_argument("--driver", choices=("pybullet", "fci", "can"), default="pybullet")
-    parser.add_argument("--faults", type=float, default=0.0, metavar="SHARE")
-    parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     found: dict[str, Any] = {"driver": args.driver, "faults": args.faults, "runs": []}
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
@@ -158,10 +156,8 @@ def main() -> None:
         stack.close()
         found["arm"] = None if summary is None else json.loads(summary.read_text())
     found["trips"] = [run["fault"] for run in found["runs"] if run["fault"]]
-    text = json.dumps(found, indent=1)
-    print(text)
-    if args.json is not None:
-        args.json.write_text(text + "\n")
+    print(json.dumps(found, indent=1))
+    write(args.json, found)
 
 
 if __name__ == "__main__":

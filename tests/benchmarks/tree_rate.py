@@ -26,7 +26,8 @@ from adapter.learning.tree_data import TreeData
 from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_zxz
 from sim.falls.data_set import data_set
-from sim.falls.fall import TreeLimits, TreeTruth, atlas
+from sim.falls.fall import TreeTruth, atlas
+from sim.truth import Limits
 from tests.helpers.benchmark import Row, options, write
 
 
@@ -55,7 +56,7 @@ def floating_panda() -> TreeTruth:
         matrix_from_zxz(model.lam[:, :3]),
         model.lam[:, 3:],
         model.theta,
-        TreeLimits(limits.lower, limits.upper, limits.velocity, limits.effort),
+        Limits(limits.lower, limits.upper, limits.velocity, limits.effort, np.inf * limits.effort),
         model.gravity,
     )
 

@@ -7,7 +7,6 @@ command's own code.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
@@ -38,8 +37,8 @@ from adapter.runs.score import reference_from, schema_score, theta_score
 from adapter.signals.records import stamp_of
 from drivers.interface import Driver
 from sim.scenarios import Scenario, build
+from tests.helpers.benchmark import Row, options, shown, write
 
-Row = dict[str, Any]
 LATE_S, END_S = 15.0, 30.0
 
 
@@ -319,10 +318,8 @@ TRIALS: dict[str, tuple[Callable[[Any], Row], list[Any]]] = {
 
 def main() -> None:
     """Run the trials that were asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, workers=2)
     parser.add_argument("trials", nargs="*", metavar="TRIAL", help=f"of {', '.join(TRIALS)}")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seeds", type=int, help="only so many jobs of each trial")
     args = parser.parse_args()
     chosen = args.trials or list(TRIALS)
@@ -337,15 +334,10 @@ def main() -> None:
             found[name] = []
             for row in pool.map(trial, jobs[: args.seeds]):
                 found[name].append(row)
-                shown = (
-                    f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()
-                )
-                print(name, *shown, flush=True)
-            print(
-                f"{name}: {len(found[name])} trials in {time.monotonic() - began:.0f} s", flush=True
-            )
-    if args.json is not None:
-        args.json.write_text(json.dumps(found, indent=1, default=float) + "\n")
+                print(name, shown(row), flush=True)
+            spent_s = time.monotonic() - began
+            print(f"{name}: {len(found[name])} trials in {spent_s:.0f} s", flush=True)
+    write(args.json, json.loads(json.dumps(found, default=float)))
 
 
 if __name__ == "__main__":

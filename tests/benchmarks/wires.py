@@ -68,8 +68,8 @@ def fci(minutes: float, protocol: int, busy: bool) -> dict[str, Any]:
             arm = FciArm(address)
             arm.connect()
             arm.read()
-            reader_pid = arm.reader_pid
-            assert reader_pid is not None
+            assert arm._connection is not None
+            reader_pid = arm._connection.reader.pid
             with RealTime(min(split_cores()[0])):
                 while arm.read() and time.monotonic_ns() - arm.arrived_ns > FRESH_NS:
                     pass  # what came while memory was locked
@@ -151,9 +151,8 @@ def can_virtual(minutes: float) -> dict[str, Any]:
     from sim.scenarios import build
 
     far = can.Bus(interface="virtual", channel="bench")
-    near = can.Bus(interface="virtual", channel="bench")
     boards = Boards(far, build("nominal"))
-    served = ServedBus(near, boards)
+    served = ServedBus("bench", boards)
     address = "can://bench?interface=virtual"
     arm = DamiaoArm(address, allow_motion=True, bus=served)
     arm.connect()

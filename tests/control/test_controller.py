@@ -15,8 +15,8 @@ from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from drivers.interface import JointSample
-from sim.plant import SimulatedArm
 from sim.scenarios import build
+from tests.helpers.lockstep_drivers import opened
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
@@ -29,38 +29,6 @@ class Floating:
 
     paced, adds_gravity, period_ns, arrived_ns, delay_ns = True, True, MS, 1, MS
     joint_names = PANDA.tree.joint_names
-
-
-class Weightless:
-    """A simulated arm behind a controller of its own that holds its weight, like a Panda."""
-
-    paced, can_move, adds_gravity, arrived_ns, plant_time_ns = False, True, True, 0, 0
-    delay_ns = MS
-
-    def __init__(self) -> None:
-        self.arm = SimulatedArm(build("nominal", noise="none").plant())
-        self.joint_names, self.link_names = self.arm.joint_names, self.arm.link_names
-        self.period_ns, self.intake = self.arm.period_ns, self.arm.intake
-        self._model = ModelFeedforward.of(PANDA)
-        self._q = READY
-
-    def connect(self) -> None:
-        self.arm.connect()
-
-    def read(self) -> JointSample:
-        sample = self.arm.read()
-        self._q = sample.q
-        return sample
-
-    def command(self, tau) -> None:
-        still = np.zeros(7)
-        self.arm.command(tau + self._model(self._q, still, still))
-
-    def stop(self) -> None:
-        self.arm.stop()
-
-    def close(self) -> None:
-        self.arm.close()
 
 
 def _sample(k: int, q=READY, tau=None) -> JointSample:
@@ -146,10 +114,9 @@ def test_an_arm_that_carries_itself_gets_no_gravity_from_feedback_nor_model():
     for name, model in (("feedback", None), ("model", ModelFeedforward.of(PANDA))):
         controller = ExcitationController(LIMITS, ExcitationSettings(seed=3), feedforward=model)
         commands = []
-        arm = Weightless()
         each = lambda sample, tau, to=commands: to.append(tau)  # noqa: E731
-        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=each)
-        arm.close()
+        with opened("fci", build("nominal", noise="none")) as (arm, _):
+            result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=each)
         assert (result.ended, result.fault) == ("duration", None)
         found = controller.tracking()["feedback" if model is None else "feedforward"]
         worst[name] = max(found["max_rad"])

@@ -4,8 +4,8 @@ Faults that cost samples alone are put into a recording, those that end a run in
 arm under its controller; the last tests have all of the first there, too: the parameters after a
 run with faults are those of the run without, within their deviations. Much of θ is not seen by any
 torque, and its deviations are wide: therefore the torques that both predict on unseen motion are
-compared too, and their errors against the true ones. The whole grid of faults and shares:
-`python -m tests.helpers.fault_runs`.
+compared too, and their errors against the true ones. Faults by the thousand:
+`tests/benchmarks/fault_trials.py`.
 """
 
 from __future__ import annotations

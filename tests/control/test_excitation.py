@@ -20,9 +20,8 @@ from adapter.control.limits import MotionLimits
 from adapter.control.push_bound import PushBound, left_at_most, push_bound
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.effects.robots import to_urdf
-from adapter.errors import ControlError, SettingsError
+from adapter.errors import SettingsError
 from adapter.model.robots import documented
-from drivers.interface import JointSample
 from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.live_tools import played
@@ -179,17 +178,6 @@ def test_the_simulated_arm_follows(scenario, with_model):
     if with_model and scenario == "nominal":
         assert max(found["rms_rad"]) < 0.002
     arm.close()
-
-
-def test_blind_for_long_the_controller_gives_up():
-    controller = ExcitationController(LIMITS)
-    q = build("nominal").truth.ready
-    good = JointSample(0, q, np.zeros(7), np.zeros(7))
-    first = controller.step(good)
-    bad = np.full(7, np.nan)
-    np.testing.assert_array_equal(controller.step(JointSample(10**7, bad, bad, bad)), first)
-    with pytest.raises(ControlError, match="no usable joint reading"):
-        controller.step(JointSample(3 * 10**7, bad, bad, bad))
 
 
 def test_forces_at_the_hand_that_a_motion_is_ended_by() -> None:

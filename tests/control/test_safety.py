@@ -5,8 +5,6 @@ And an arm that something holds and pushes before it starts, or with a load nobo
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -22,8 +20,6 @@ from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
 from adapter.signals.front_end import FrontEnd
-from drivers.damiao import holding
-from drivers.fci import torque_control
 from drivers.interface import JointSample
 from sim.scenarios import SIDE_STEP_M, STAND_OFF_M, build
 from sim.truth import FLANGE_M
@@ -118,13 +114,6 @@ def test_a_braked_arm_is_not_carried_with_a_push(trusted) -> None:
     assert (np.abs(carried - own - strange) <= left_at_most(LIMITS.effort)).all() == trusted
     if trusted:
         np.testing.assert_allclose(weight.within(q, own + strange), own + strange, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", BEGINS_S)
-def test_a_driver_in_lockstep_gives_the_clock_back(name) -> None:
-    with opened(name, build("nominal", 1)) as (arm, _):
-        arm.connect()
-    assert holding.time is torque_control.time is time
 
 
 def test_what_was_learned_stops_a_held_arm_sooner() -> None:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from adapter.cli import main
 from adapter.discovery import Discovery, discover, learn
 from adapter.discovery.hypotheses import FREE, Option
 from adapter.discovery.tree_search import TreeSearch, cycle
 from adapter.errors import ModelError, SettingsError
-from adapter.model.model_file import load_model
 from adapter.model.spatial import log_rotation, matrix_from_zxz
-from drivers.files.mcap import write_log
 from tests.helpers.discovery_data import (
     RATE_HZ,
     SHORT,
@@ -102,23 +97,6 @@ def test_a_missing_link_leaves_its_child_open() -> None:
         learn(found)
 
 
-def test_base_at_rest_in_the_recording_is_the_root() -> None:
-    case = record(robot("panda"), SHORT, 7, base=True)
-    found = discover(case.log)
-    assert found.root == case.root != "base"
-    assert set(confidences(found)) == case.edges and found.root_confidence > 0.99
-
-
-def test_gaps_and_slow_sensors_are_bridged() -> None:
-    case = _case("panda", SHORT, 1)
-    log = case.log
-    twists, accels = log.twists.copy(), log.accels.copy()
-    twists[np.arange(len(log)) % 5 != 0] = np.nan
-    accels[300:360, 2] = np.nan
-    found = discover(replace(log, twists=twists, accels=accels))
-    assert set(confidences(found)) == case.edges
-
-
 def test_lambda_follows_and_its_spread_is_what_it_is_off_by() -> None:
     case = _case("panda", SHORT, 0)
     learned = learn(discover(case.log))
@@ -132,14 +110,6 @@ def test_lambda_follows_and_its_spread_is_what_it_is_off_by() -> None:
     off = np.concatenate([turn, found[:, 3:] - true[:, 3:]], axis=1)
     assert np.abs(off).max() < 1e-3
     assert 0.7 < np.sqrt(np.mean((off / learned.schema.std[shown]) ** 2)) < 1.4
-
-
-def test_positions_and_twists_alone_serve() -> None:
-    case = _case("panda", SHORT, 0)
-    nothing = np.full_like(case.log.q, np.nan)
-    bare = discover(replace(case.log, dq=nothing, tau=nothing, accels=None))
-    assert bare.log.tau is None and bare.log.measured == ("w", "v")
-    assert {(e.joint, e.link, e.parent) for e in bare.edges} == case.edges
 
 
 def _chain(case: Case) -> np.ndarray:
@@ -184,21 +154,6 @@ def _by_all_combinations(options: list[tuple[Option, ...]]) -> float:
 
     extend(())
     return best
-
-
-def test_command_writes_tree_and_model(tmp_path: Path) -> None:
-    case = _case("panda", Motion(seconds=2.0, rate_hz=RATE_HZ), 8)
-    log = case.log
-    write_log(log, tmp_path / "log.mcap", {})
-    names = {key: str(tmp_path / key) for key in ("model.json", "figures.json")}
-    arguments = ["--model", names["model.json"], "--json", names["figures.json"]]
-    assert main(["discover", str(tmp_path / "log.mcap"), *arguments]) == 0
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    told = {(e["joint"], e["link"], e["parent"]) for e in figures["edges"]}
-    assert told == case.edges and figures["joints"] == 7 and figures["undecided"] == []
-    model = load_model(names["model.json"])
-    assert list(model.tree.link_names) == list(_chain(case))
-    assert max(figures["torque_rmse_nm"]) < 0.2  # of torques up to 60 N m, noise 0.1 a sample
 
 
 @pytest.mark.parametrize(

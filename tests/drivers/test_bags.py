@@ -1,7 +1,6 @@
 """Bags of ROS 1 and rosbag2, written by `rosbags`, read like our own recordings."""
 
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ import zstandard
 from drivers.files.mcap import read_log
 from drivers.interface import DriverError
 from tests.helpers.bags import Motion, write_ros1, write_ros1_mcap, write_ros2
+from tests.helpers.robot_models import shared
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 KINDS = (
@@ -18,7 +18,6 @@ KINDS = (
     "franka_msgs/msg/FrankaRobotState",
     "franka_msgs/msg/FrankaState",
 )
-BAGS = Path(__file__).parents[2].parent / "shared" / "data" / "unisa_bags"
 SEVEN = tuple(f"arm_joint{i + 1}" for i in range(7))
 
 
@@ -59,17 +58,6 @@ def test_a_single_file_under_a_hostile_name_and_packed(tmp_path):
         log = read_log(tmp_path / name)
         equal(log, motion)
         assert log.path == tmp_path / name
-
-
-def test_several_topics_are_named_and_one_is_chosen(tmp_path):
-    left, right = Motion.of(seed=2), Motion.of(seed=3)
-    topics = {"/left/state": (JOINT_STATE, left), "/right/state": (KINDS[1], right)}
-    path = write_ros2(tmp_path / "bag", topics)
-    with pytest.raises(DriverError, match=r"2 topics .*: /left/state, /right/state; .*--topic"):
-        read_log(path)
-    equal(read_log(path, topic="/right/state"), right)
-    with pytest.raises(DriverError, match=r"no message on /middle; found: .*/left/state"):
-        read_log(path, topic="/middle")
 
 
 def test_the_usual_topic_comes_first_where_it_tells_efforts_and_the_others_are_named(tmp_path):
@@ -162,9 +150,8 @@ def test_what_sqlite_has_not_written_in_is_said(tmp_path):
     assert "-wal is not read" in read_log(path).warnings[0]
 
 
-@pytest.mark.skipif(not BAGS.exists(), reason="../shared, which users do not have")
 @pytest.mark.parametrize(("name", "joints", "samples"), [("panda", 7, 727), ("ur10", 6, 3441)])
 def test_bags_of_real_arms(name, joints, samples):
-    log = read_log(BAGS / f"{name}_exciting_trajectory.db3")
+    log = read_log(shared(f"data/unisa_bags/{name}_exciting_trajectory.db3"))
     assert (len(log), len(log.joint_names)) == (samples, joints)
     assert np.isfinite(log.tau).all()

@@ -10,33 +10,9 @@ import numpy as np
 import pytest
 
 from drivers.fci import codec, tables
-from drivers.fci.codec import COMMAND_DTYPE, STATE_DTYPE, CommandEncoder, StateDecoder, WireError
+from drivers.fci.codec import CommandEncoder, StateDecoder, WireError
 from tests.helpers import fci_peer
-from tests.sim.test_fci_server_codec import OFFSETS
 
-# Beside the fields of numbers: offset in protocol 5, in protocol 10.
-STATE_OFFSETS = {
-    **OFFSETS,
-    "message_id": (0, 0),
-    "motion_generator_mode": (2280, 1288),
-    "controller_mode": (2281, 1289),
-    "errors": (2282, 1290),
-    "reflex_reason": (2323, 1331),
-    "robot_mode": (2364, 1372),
-    "control_command_success_rate": (2365, 1373),
-}
-COMMAND_OFFSETS = {
-    "message_id": 0,
-    "q_c": 8,
-    "dq_c": 64,
-    "O_T_EE_c": 120,
-    "O_dP_EE_c": 248,
-    "elbow_c": 296,
-    "valid_elbow": 312,
-    "motion_generation_finished": 313,
-    "tau_J_d": 314,
-    "torque_command_finished": 370,
-}
 PROTOCOLS = pytest.mark.parametrize("protocol", [5, 10])
 Q = tuple(0.25 * k for k in range(1, 8))  # exact in f32 as well
 DQ = tuple(-0.5 * k for k in range(1, 8))
@@ -53,23 +29,6 @@ def decode(protocol, data):
     return StateDecoder(protocol).decode(memoryview(data))
 
 
-@pytest.mark.parametrize(("column", "protocol", "size"), [(0, 5, 2373), (1, 10, 1377)])
-def test_every_field_of_a_state_lies_where_the_table_says(column, protocol, size):
-    dtype = STATE_DTYPE[protocol]
-    expected = {n: o[column] for n, o in STATE_OFFSETS.items() if o[column] is not None}
-    assert {name: dtype.fields[name][1] for name in dtype.names} == expected
-    assert dtype.itemsize == size
-
-
-@pytest.mark.parametrize(("protocol", "size"), [(5, 370), (10, 371)])
-def test_every_field_of_a_command_lies_where_the_table_says(protocol, size):
-    dtype = COMMAND_DTYPE[protocol]
-    assert {n: dtype.fields[n][1] for n in dtype.names} == {
-        name: offset for name, offset in COMMAND_OFFSETS.items() if offset < size
-    }
-    assert dtype.itemsize == size
-
-
 @PROTOCOLS
 def test_a_golden_state_is_read_back(protocol):
     got = decode(protocol, frame(protocol, modes=(2, 1, 3), errors=(0, 40), reflex=(25,)))
@@ -84,24 +43,6 @@ def test_a_golden_state_is_read_back(protocol):
         "base_acceleration_invalid_reading",
     )
     assert tables.raised(got.status.reflex_reason) == ("communication_constraints_violation",)
-
-
-@PROTOCOLS
-def test_a_state_lies_anywhere_in_the_buffer_and_owns_its_numbers(protocol):
-    data = bytearray(b"\xff" * 37 + frame(protocol) + b"\xff" * 11)
-    size = fci_peer.STATE_SIZE[protocol]
-    got = StateDecoder(protocol).decode(memoryview(data), 37, size)
-    data[:] = bytes(len(data))
-    assert tuple(got.q) == Q
-    assert tuple(got.tau_J) == TAU
-
-
-@PROTOCOLS
-def test_numbers_that_are_none_are_delivered(protocol):
-    got = decode(protocol, frame(protocol, q=(math.nan, math.inf, *Q[2:])))
-    assert math.isnan(got.q[0])
-    assert math.isinf(got.q[1])
-    assert tuple(got.q[2:]) == Q[2:]
 
 
 @PROTOCOLS
@@ -156,17 +97,6 @@ def test_golden_requests():
     rest = bytes(1 + 7 * 8)
     assert v10 == struct.pack("<IIIII6d", 1, 4, 125, 2, 4, *deviation, *deviation) + rest
     assert codec.request(12, 5) == struct.pack("<III", 12, 5, 12)
-
-
-def test_replies_are_cut_out_of_the_stream_however_it_comes():
-    first = fci_peer.reply(0, 7, struct.pack("<BH", 1, 9) + bytes(50))
-    second = fci_peer.reply(1, 8, b"\1")
-    parser = codec.ReplyParser()
-    got = [reply for k in (first + second) for reply in parser.feed(bytes([k]))]
-    assert [reply.command_id for reply in got] == [7, 8]
-    assert codec.connect_reply(got[0].payload) == (1, 9)
-    assert codec.status_reply(got[1].payload) == 1
-    assert [r.command_id for r in codec.ReplyParser().feed(first + second)] == [7, 8]
 
 
 @pytest.mark.parametrize("size", [0, 11, 1 << 30])

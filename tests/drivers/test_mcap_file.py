@@ -61,13 +61,6 @@ def test_commands_and_attachments(tmp_path):
     assert log.commands.stamp_ns.tolist() == log.stamp_ns.tolist()
 
 
-def test_a_recording_is_never_overwritten_by_accident(tmp_path):
-    path = record(tmp_path / "a.mcap", samples(3))
-    with pytest.raises(DriverError, match="exists"):
-        McapWriter(path, JOINTS)
-    assert len(read_log(path)) == 3
-
-
 @pytest.mark.parametrize("compression", CompressionType)
 @pytest.mark.parametrize("chunking", [True, False])
 def test_files_of_others(tmp_path, compression, chunking):

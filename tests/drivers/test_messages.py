@@ -1,16 +1,14 @@
 """Messages of any type: public definitions are the public ones, and values survive both ways."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from drivers.files.estimates import EstimateNames, estimate_fields, estimate_values
-from drivers.files.mcap import McapWriter, read_estimates, read_log, read_messages, recover
+from drivers.files.mcap import McapWriter, read_estimates, read_log, read_messages
 from drivers.files.messages import Message, TransformsEncoder, decode, encode, header
 from drivers.files.ros import CdrError
 from drivers.files.ros_types import DIAGNOSTICS, ESTIMATE, STRING, TF, schemas
@@ -106,43 +104,3 @@ def test_the_recording_of_the_repository_is_read_by_everybody():
     assert_read_by_everybody(path, {"/joint_states", "/joint_commands", "/estimates"})
     last = list(read_estimates(path))[-1]
     assert last["lambda_converged"] and last["joint_names"][0] == "panda_joint1"
-
-
-def test_estimates_in_json_are_read_and_told_anew(tmp_path, old_recording):
-    """Recordings before version 0.2."""
-    before = list(read_estimates(old_recording))
-    assert before[0]["theta"].shape == (1, 10) and np.isnan(before[0]["theta"][0, 9])
-    recover(old_recording, tmp_path / "new.mcap")
-    found = assert_read_by_everybody(tmp_path / "new.mcap", {"/estimates", "/joint_states"})
-    assert len(found["/estimates"]) == len(before) == 3
-    after = list(read_estimates(tmp_path / "new.mcap"))
-    for old, new in zip(before, after, strict=True):
-        assert all(same(new[key], value) for key, value in old.items())
-    assert after[0]["joint_names"] == ("a", "b")
-
-
-@pytest.fixture
-def old_recording(tmp_path) -> Path:
-    """As version 0.1 wrote them."""
-    path, names = tmp_path / "old.mcap", ["a", "b"]
-    with McapWriter(path, names, metadata={"config": {}}) as whole:
-        whole.write_joint_state(1, np.zeros(2), np.zeros(2), np.zeros(2))
-    (state,) = read_messages(path, "/joint_states")
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2", library="panda-adapter")
-        learner = {"pipeline": {"learner": {"effects": ["coulomb_friction"]}}}
-        entries = {"joint_names": json.dumps(names), "config": json.dumps(learner)}
-        writer.add_metadata("panda_adapter", entries)
-        schema = writer.register_schema(state.schema, "ros2msg", schemas()[state.schema].encode())
-        states = writer.register_channel("/joint_states", "cdr", schema)
-        writer.add_message(states, 1, encode(state.schema, state.fields), 1)
-        schema = writer.register_schema("panda_adapter.Estimate", "jsonschema", b"{}")
-        channel = writer.register_channel("/estimates", "json", schema)
-        for k in range(3):
-            told = {"stamp_ns": k, "learned": 5 * k, "lambda_source": "measured"}
-            told |= {"lambda_converged": True, "theta_converged": False, "effects": [[0.5, k]]}
-            told |= {"lambda": [[1.0 * k] * 6] * 2, "theta": [[2.0] * 9 + [None]]}
-            writer.add_message(channel, k, json.dumps(told).encode(), k)
-        writer.finish()
-    return path

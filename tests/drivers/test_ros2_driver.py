@@ -239,7 +239,7 @@ def _silence_of_the_loop_brakes(address):
                 arm.read()
         arm.stop()
         patiently(lambda: push(arm, 0.0, 10), lambda: (arm.close(), arm.connect()))  # goes on
-        os.kill(arm.bridge_pid, signal.SIGKILL)
+        os.kill(arm._bridge.pid, signal.SIGKILL)
         with pytest.raises(DriverError, match="the bridge to DDS ended"):
             for _ in range(2000):
                 arm.read()

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import torch
 
@@ -42,14 +41,8 @@ from adapter.experiments.baselines.paper import (
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
-from adapter.physics.networks import (
-    DTYPE,
-    FrameMotion,
-    inverse_dynamics,
-    link_motion,
-    theta_from_log_cholesky,
-)
-from tests.helpers.arm_data import pin_tree
+from adapter.physics.networks import DTYPE, FrameMotion, inverse_dynamics, theta_from_log_cholesky
+from tests.helpers.arm_data import free_answers, pin_tree
 from tests.helpers.robot_models import relative
 
 # A leg (joint 0), a torso (1) and an arm on it that branches (2, 3, 4).
@@ -69,31 +62,12 @@ def samples(seed: int, count: int) -> TreeData:
     lam, theta = robot(seed)
     rng = np.random.default_rng([seed, count])
     q, dq, ddq = (rng.uniform(-s, s, (count, TREE.n)) for s in (1.0, 1.0, 3.0))
-    base = BodyMotion(*(rng.normal(size=(count, 3)) for _ in range(4)))
-    tau = _pinocchio(lam, theta, q, dq, ddq, base)
-    signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
-    found = link_motion(TREE, torch.from_numpy(lam), signals, FrameMotion.of(base.rows()))
-    v, w, a, dw = (x[:, 1:].numpy() for x in found)
-    return TreeData(TREE, q, dq, ddq, tau, base, BodyMotion(w, a, dw, v))
-
-
-def _pinocchio(lam, theta, q, dq, ddq, base) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """Torques (m, 6 + n): the base is a free body in a world without gravity."""
+    w, a, dw, v = rng.normal(size=(4, count, 3))
     frames = matrix_from_zxz(lam[:, :3]), lam[:, 3:]
     model = pin_tree(TREE.parent, *frames, theta, np.zeros(3), free=True)
-    data = model.createData()
-    at = [model.joints[j].idx_v for j in range(2, model.njoints)]
-    tau = np.zeros((len(q), 6 + TREE.n))
-    for k in range(len(q)):
-        place, speed, accel = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
-        place[[i + 1 for i in at]] = q[k]
-        speed[:3], speed[3:6], speed[at] = base.v[k], base.w[k], dq[k]
-        # Pinocchio's spatial acceleration of the free flyer: d/dt of [v; w] in body axes.
-        accel[:3] = base.a[k] - np.cross(base.w[k], base.v[k])
-        accel[3:6], accel[at] = base.dw[k], ddq[k]
-        found = pin.rnea(model, data, place, speed, accel)
-        tau[k] = np.concatenate([found[:6], found[at]])
-    return tau
+    tau, motion, _ = free_answers(model, (q, dq, ddq), (v, w, a, dw))
+    links = BodyMotion(*(motion[:, :, k] for k in (1, 2, 3, 0)))
+    return TreeData(TREE, q, dq, ddq, tau, BodyMotion(w, a, dw, v), links)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -25,11 +25,7 @@ from adapter.experiments.page.page import render_experiment
 from adapter.experiments.page.words import headline, scientific, sentences
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.model.tree import Tree
-from tests.helpers.browser import (
-    ids_of_a_whole_page,
-    shown_without_complaint,
-    text_of,
-)
+from tests.helpers.browser import ids_of_a_whole_page, shown_without_complaint, text_of
 
 NAMES = ("back_z", "back_x", "neck_y", "r_arm_x", "r_arm_y", "l_leg_x", "l_leg_y")
 PARENT = (-1, 0, 1, 1, 3, -1, 5)

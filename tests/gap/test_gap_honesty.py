@@ -41,7 +41,7 @@ from adapter.gap.held_out import (
 from adapter.gap.result import Leftover
 from adapter.gap.rivals import DATES, Standing, price
 from adapter.gap.scan import BELIEF
-from adapter.gap.search import Budget, Found, search, weak, worst
+from adapter.gap.search import Found, search, weak, worst
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.words import as_json, console_summary, headline
 from adapter.judgement.priors import theta_prior
@@ -247,14 +247,6 @@ def test_a_search_that_runs_out_of_rounds_says_so() -> None:
     assert not whole.ran_out and 3 <= whole.rounds < 24
     named = {(e.candidate.effect.name, e.candidate.joint) for e in whole.fit.named}
     assert {("coulomb_friction", JOINT), ("viscous_friction", 5)} <= named
-
-
-def test_a_budget_of_rounds() -> None:
-    budget = Budget(2)
-    assert [budget.spend() for _ in range(3)] == [True, True, False]
-    assert budget.made == 2 and budget.ran_out
-    enough = Budget(3)
-    assert enough.spend() and enough.made == 1 and not enough.ran_out
     with pytest.raises(ValueError, match="round"):
         GapSettings(rounds=0)
 

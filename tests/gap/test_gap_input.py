@@ -19,8 +19,8 @@ from sim.hidden.record import write
 from tests.benchmarks.live_trials import trial_of
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, pin_model, record, rnea
 from tests.helpers.gap_tools import pinocchio_recording
+from tests.helpers.robot_models import real_log
 
-SHARED = Path(__file__).parents[2].parent / "shared"
 NAMES = panda_model().tree.joint_names
 ORDER = [0, 1, 2, 3, 4, 6, 5]
 
@@ -38,17 +38,6 @@ def refused(log: Log, kind: str, model: SelfModel | None = None) -> str:
     assert caught.value.kind == kind, said
     assert said.endswith(".") and "\n" not in said
     return said
-
-
-@cache
-def real_log() -> Log:
-    if not SHARED.is_dir():
-        pytest.skip("the real logs are not beside the project")
-    start = f"{SHARED / 'data' / 'panda_gaz2019' / 'exciting_traj_'}"
-    signals = (np.loadtxt(f"{start}{x}.txt") for x in ("positions", "velocity", "torques"))
-    q, dq, tau = (x.reshape(-1, 7) for x in signals)
-    stamps = np.round(1e9 * np.loadtxt(f"{start}time.txt")).astype(np.int64)
-    return Log(Path("real.mcap"), NAMES, stamps, q, dq, tau)
 
 
 @cache

@@ -20,14 +20,8 @@ from adapter.effects.base import LINK, Motion
 from adapter.effects.bodies import theta_of
 from adapter.effects.by_joint import AT_REST
 from adapter.effects.torque import sensed_torque
-from adapter.gap.candidates import (
-    Candidate,
-    log_odds,
-    patterns,
-    signatures,
-    stages_of,
-)
-from adapter.gap.evidence import LEAST_NM, Carried, noise_of, score, scores
+from adapter.gap.candidates import Candidate, log_odds, patterns, signatures, stages_of
+from adapter.gap.evidence import LEAST_NM, Carried, noise_of, score
 from adapter.gap.findings import parameter_std
 from adapter.gap.fit import (
     Fit,
@@ -146,12 +140,6 @@ def test_low_pass_keeps_its_band_and_its_instants():
     for hz, share in ((0.5, 1.0), (4.0, 1.0), (6.0, 1.0), (13.5, 0.0), (30.0, 0.0)):
         out = low(np.sin(2 * np.pi * hz * t)[:, None])[:, 0]
         assert np.allclose(out, share * np.sin(2 * np.pi * hz * at), atol=0.02), hz
-
-
-def test_low_pass_is_linear_and_takes_tables():
-    x = np.random.default_rng(0).standard_normal((700, 3, 2))
-    assert np.allclose(low(x)[:, 1, 0], low(x[:, 1, :1])[:, 0])
-    assert np.allclose(low(2.0 * x[:, 0] - x[:, 1]), 2.0 * low(x[:, 0]) - low(x[:, 1]))
 
 
 @pytest.mark.parametrize(("sharp", "room"), [(False, 2e-3), (True, 2e-2)])
@@ -288,18 +276,6 @@ def test_score_is_a_ratio_of_marginal_likelihoods(seed: int):
     assert np.allclose(found.x, own**2 * (X @ np.linalg.solve(cov, data)))
 
 
-def test_scores_of_a_stack_are_those_one_by_one():
-    parts = [gaussians(seed) for seed in range(4)]
-    G = np.array([X @ X.T for X, *_ in parts])
-    g = np.array([X @ data for X, *_, data in parts])
-    own = parts[0][1]
-    evidence, chi2, x = scores(G, g, own)
-    each = [score(a, b, own) for a, b in zip(G, g, strict=True)]
-    assert np.allclose(evidence, [one.log_evidence for one in each])
-    assert np.allclose(chi2, [one.chi2 for one in each])
-    assert np.allclose(x, [one.x for one in each])
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_what_is_carried_along_is_integrated_out(seed: int):
     X, own, N_, std, data = gaussians(seed)
@@ -320,16 +296,6 @@ def test_what_is_known_of_carried_coefficients():
     assert np.allclose(carried.x, gain @ data)
     assert np.allclose(carried.covariance(), np.diag(std**2) - gain @ (N_.T * std**2))
     assert np.allclose(carried.std() ** 2, np.diagonal(carried.covariance()))
-
-
-def test_reduced_takes_stacks_of_products():
-    X, _, N_, std, data = gaussians(2)
-    carried = Carried(N_, std, data)
-    G, g = carried.reduced(
-        np.stack([X @ X.T] * 2), np.stack([X @ N_.T] * 2), np.stack([X @ data] * 2)
-    )
-    one = carried.without(X)
-    assert np.allclose(G, one[0]) and np.allclose(g, one[1])
 
 
 # ---------------------------------------------------------------- signatures

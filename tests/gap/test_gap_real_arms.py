@@ -8,17 +8,10 @@ import numpy as np
 import pybullet_data
 import pytest
 
-from adapter.cli import main
 from adapter.gap.result import GapResult
 from adapter.gap.workflow import GapSettings, find_gap
+from tests.helpers.robot_models import real_log, shared
 
-SHARED = Path(__file__).parents[2].parent / "shared"
-MODEL = SHARED / "models" / "panda_gaz2019.urdf"
-DATA = SHARED / "data" / "panda_gaz2019"
-pytestmark = pytest.mark.skipif(
-    not (DATA.is_dir() and MODEL.is_file()),
-    reason="the folder of real logs and models is not beside the project",
-)
 SPLIT_S = 14.0
 BEFORE = np.array([0.28, 0.77, 0.37, 0.58, 0.34, 0.21, 0.28])  # N m, of the model as it is
 AFTER = np.array([0.16, 0.26, 0.16, 0.17, 0.08, 0.05, 0.05])  # N m, at most
@@ -29,25 +22,14 @@ NEAR_NOISE = 1.6  # times the noise: no more is left without a word (1.44 on joi
 ROOM = 0.15  # N m by which a size may be off, and half of it: what else is named has a share
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log, imported as a user would."""
-    path = tmp_path_factory.mktemp("panda") / "panda.mcap"
-    files = {"time": "time", "q": "positions", "dq": "velocity", "tau": "torques"}
-    sources = [f"{key}={DATA}/exciting_traj_{name}.txt" for key, name in files.items()]
-    arguments = ["import", *sources, "--flat", "--robot", "panda", "--to", str(path)]
-    assert main(arguments) == 0
-    return path
-
-
-def told(log: Path, model: Path) -> GapResult:
-    return find_gap([log], model, GapSettings(validate_from_s=SPLIT_S))
+def told(model: Path) -> GapResult:
+    return find_gap([real_log()], model, GapSettings(validate_from_s=SPLIT_S))
 
 
 @pytest.fixture(scope="module")
-def published(log: Path) -> GapResult:
+def published() -> GapResult:
     """Against the model that was identified on this arm."""
-    return told(log, MODEL)
+    return told(shared("models/panda_gaz2019.urdf"))
 
 
 def test_gap_before_is_that_of_the_recipe(published: GapResult) -> None:
@@ -80,9 +62,9 @@ def test_what_is_left_is_noise_or_is_said(published: GapResult) -> None:
 
 
 @pytest.mark.slow
-def test_dummy_inertias_are_said_to_be_wrong_and_no_load_is(log: Path) -> None:
+def test_dummy_inertias_are_said_to_be_wrong_and_no_load_is() -> None:
     urdf = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
-    result = told(log, urdf)
+    result = told(urdf)
     told_of = [(f.effect, f.joints) for f in result.findings]
     wrong = {joint for effect, joints in told_of for joint in joints if effect == "link_inertia"}
     assert len(wrong) >= 5, told_of

@@ -1,15 +1,12 @@
 """The timing check finds what was done to a recording's clock, and nothing where nothing was."""
 
-from pathlib import Path
-from time import process_time
-
 import numpy as np
 import pytest
 
 from adapter.screening.timing import check_timing, uniform
 from tests.helpers.arm_data import Motion, trajectory
+from tests.helpers.robot_models import real_log
 
-SHARED = Path(__file__).parents[2].parent / "shared"
 Signals = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -113,21 +110,9 @@ def test_short_recordings(m: int) -> None:
     timing.words()
 
 
-def test_it_takes_little_time() -> None:
-    signals = recording(0)
-    check_timing(*signals)
-    before = process_time()
-    check_timing(*signals)
-    assert process_time() - before < 1.0  # 0.04 s where nothing else runs
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real logs are not beside the project")
 def test_a_real_log() -> None:
-    start = f"{SHARED / 'data' / 'panda_gaz2019' / 'exciting_traj_'}"
-    t = np.loadtxt(f"{start}time.txt")
-    names = ("positions", "velocity", "torques")
-    q, dq, tau = (np.loadtxt(f"{start}{name}.txt").reshape(-1, 7) for name in names)
-    timing = check_timing(np.round(1e9 * t).astype(np.int64), q, dq, tau)
+    log = real_log()
+    timing = check_timing(log.stamp_ns, log.q, log.dq, log.tau)
     assert timing.rate_hz == pytest.approx(1000, rel=0.01)
     assert timing.repeated == pytest.approx(0.055, abs=0.002)
     assert timing.lateness_s == pytest.approx(5.37e-3, abs=1e-4)

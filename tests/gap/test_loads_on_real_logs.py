@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
@@ -20,10 +21,10 @@ from adapter.runs.library import make_log
 from adapter.screening.screen import refuse
 from adapter.screening.timing import lateness
 from drivers.files.mcap import Log
-from sim.hidden.record import log_of
 from sim.hidden.trial import nominal_urdf
-from sim.truth import Array, panda
+from sim.truth import panda
 from tests.helpers.gap_effects import regressor
+from tests.helpers.robot_models import real_log
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "panda_gaz2019"
 pytestmark = pytest.mark.skipif(
@@ -36,17 +37,10 @@ PRIOR = 0.02
 CENTRE_M, HALF_M = np.array([0.01, -0.02, 0.17]), 0.04  # in the last link's frame; of a cube
 
 
-@pytest.fixture(scope="module")
-def signals() -> tuple[Array, ...]:
-    """t (m,) s; q, dq, tau (m, n)."""
-    names = ("time", "positions", "velocity", "torques")
-    t, *rest = (np.loadtxt(DATA / f"exciting_traj_{name}.txt") for name in names)
-    return t, *(x.reshape(len(t), -1) for x in rest)
-
-
-def loaded(signals: tuple[Array, ...], mass: float, piece: tuple[float, float]) -> Log:
+def loaded(mass: float, piece: tuple[float, float]) -> Log:
     """A piece of the log, with what a cube of so many kg adds to the torques."""
-    t, q, dq, tau = signals
+    log = real_log()
+    t, q, tau = 1e-9 * log.stamp_ns, log.q, log.tau
     grid = np.arange(t[0], t[-1], 1e-3)
     low = butter(2, BAND_HZ, fs=1000, output="sos")
     way = sosfiltfilt(low, np.column_stack([np.interp(grid, t, x) for x in q.T]), axis=0)
@@ -57,8 +51,7 @@ def loaded(signals: tuple[Array, ...], mass: float, piece: tuple[float, float]) 
     more = regressor(panda(), way, speed, np.gradient(speed, 1e-3, axis=0))[:, :, -10:] @ body
     tau = tau + np.column_stack([np.interp(t, grid, x) for x in more.T])
     on = (t >= piece[0]) & (t < piece[1])
-    stamps = np.round(1e9 * t[on]).astype(np.int64)
-    return log_of(panda().joint_names, stamps, q[on], dq[on], tau[on])
+    return replace(log.take(on), tau=tau[on])
 
 
 def weighed(log: Log, model: SelfModel) -> RealArm:
@@ -69,23 +62,21 @@ def weighed(log: Log, model: SelfModel) -> RealArm:
     )
 
 
-def test_loads_are_weighed_and_a_bare_hand_is_bare(
-    signals: tuple[Array, ...], tmp_path: Path
-) -> None:
+def test_loads_are_weighed_and_a_bare_hand_is_bare(tmp_path: Path) -> None:
     urdf = tmp_path / "panda.urdf"
     urdf.write_text(nominal_urdf(panda()))
     model = read_robot(str(urdf))
     for mass, piece in zip(LOADS_KG, PIECES_S, strict=True):
-        arm = weighed(loaded(signals, mass, piece), model)
+        arm = weighed(loaded(mass, piece), model)
         assert arm.is_there(0) is (mass > 0.0), mass
         assert abs(arm.fit.named[0].x[0] - mass) < 0.3, mass
 
 
 @pytest.mark.filterwarnings("ignore::adapter.errors.ModelWarning")
-def test_a_load_is_told_from_inertias_that_somebody_made_up(signals: tuple[Array, ...]) -> None:
+def test_a_load_is_told_from_inertias_that_somebody_made_up() -> None:
     """Those of PyBullet's Panda: a heavier last link would explain as much."""
     model = read_robot(str(Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"))
-    arm = weighed(loaded(signals, 4.0, PIECES_S[3]), model)
+    arm = weighed(loaded(4.0, PIECES_S[3]), model)
     assert arm.is_there(0)
     assert abs(arm.fit.named[0].x[0] - 4.0) < 3.0 * arm.mass_std[0] < 2.0
 

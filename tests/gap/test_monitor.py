@@ -1,6 +1,5 @@
 """The watch over the residual names what is new, soon and once, and is quiet where nothing is."""
 
-import time
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -63,29 +62,26 @@ def disturbed(kind: str, seed: int) -> ArmData:
 
 @dataclass
 class Watched:
-    """What a monitor said, when on the arm's clock, and what a state cost it."""
+    """What a monitor said, and when on the arm's clock."""
 
     reports: list[dict[str, Any]]
     said: list[str]
-    cost_us: float
     changes: int
+
+
+def watched(data: ArmData, seed: int, rows: int = ROWS, effects: tuple[str, ...] = ()) -> Watched:
+    states, said = states_of(data), []
+    learner = learner_for(seed=seed, effects=effects)
+    monitor = Monitor(7, None, FrontEnd(panda_model()).delay_s, said.append)
+    for k in range(0, len(states), rows):
+        learner.step_table(states[k : k + rows])
+        monitor(learner, states[k : k + rows])
+    return Watched(monitor.reports, said, len(learner.changes))
 
 
 @cache
 def watch(kind: str, seed: int, rows: int = ROWS, effects: tuple[str, ...] = ()) -> Watched:
-    states = states_of(disturbed(kind, seed))
-    learner = learner_for(seed=seed, effects=effects)
-    said: list[str] = []
-    monitor = Monitor(7, None, FrontEnd(panda_model()).delay_s, said.append)
-    spent = 0.0
-    for k in range(0, len(states), rows):
-        table = states[k : k + rows]
-        learner.step_table(table)
-        before = time.perf_counter()
-        monitor(learner, table)
-        spent += time.perf_counter() - before
-    cost_us = 1e6 * spent / len(states)
-    return Watched(monitor.reports, said, cost_us, len(learner.changes))
+    return watched(disturbed(kind, seed), seed, rows, effects)
 
 
 NEW = {
@@ -173,30 +169,15 @@ def test_what_static_friction_holds_is_not_new_and_hides_no_load(seed: int) -> N
         truth = build("payload_at_20s", mass=mass, t_s=AT_S).truth if mass else arm()
         data = record(truth, Motion(SECONDS, seed, alone=(3, 12.0)))
         held = draw_bristles(np.random.default_rng(seed), 7).along(data.true[1], 1e-3)
-        states = states_of(replace(data, tau=data.tau + held))
-        learner = learner_for(seed=seed, effects=REAL_ARM_EFFECTS)
-        monitor = Monitor(7)
-        for k in range(0, len(states), ROWS):
-            learner.step_table(states[k : k + ROWS])
-            monitor(learner, states[k : k + ROWS])
-        assert bool(monitor.reports) == bool(mass)
-        assert all(report["since_s"] > AT_S - 0.3 for report in monitor.reports)
+        data = replace(data, tau=data.tau + held)
+        reports = watched(data, seed, effects=REAL_ARM_EFFECTS).reports
+        assert bool(reports) == bool(mass)
+        assert all(report["since_s"] > AT_S - 0.3 for report in reports)
 
 
 def test_rests_are_not_new() -> None:
     motion = Motion(25.0, 6, rests=((8.0, 11.0), (15.0, 20.0)))
-    learner = learner_for(seed=6)
-    monitor = Monitor(7)
-    states = states_of(record(arm(), motion))
-    for k in range(0, len(states), ROWS):
-        learner.step_table(states[k : k + ROWS])
-        monitor(learner, states[k : k + ROWS])
-    assert not monitor.reports
-
-
-def test_it_costs_little() -> None:
-    """Some 20 µs of a state's millisecond, in the learner's process; far off, not to be timed."""
-    assert watch("nothing", 20).cost_us < 500.0
+    assert not watched(record(arm(), motion), 6).reports
 
 
 def test_a_replay_reports_and_a_batch_does_not_watch() -> None:

@@ -18,7 +18,7 @@ from adapter.gap.load import HandLoad, find_load
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.rows import stuck
 from adapter.screening.screen import RecordingRefused, check_torque
-from drivers.files.mcap import Log, McapWriter
+from drivers.files.mcap import Log, write_log
 from sim.effects import payload, per_joint
 from tests.helpers.arm_data import Motion, arm, panda_model, record
 
@@ -259,9 +259,7 @@ def test_a_namespace_and_joints_of_a_gripper_are_no_other_robot() -> None:
 
 
 def written(log: Log, path: Path) -> Path:
-    with McapWriter(path, log.joint_names) as writer:
-        for stamp_ns, *signals in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
-            writer.write_joint_state(stamp_ns, *signals)
+    write_log(log, path, {})
     return path
 
 

@@ -71,26 +71,19 @@ def test_priors_are_held_and_what_any_arm_has_is_there_from_the_start() -> None:
     np.testing.assert_array_equal(begun.prior, arm.fit.prior)
 
 
-def test_a_heavy_load_is_named_and_nothing_rare_beside_it() -> None:
-    twin = next(t for t in map(draw_twin, TWINS) if t.load_kg > 2.0)
-    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
-    found = find_gap([log], documented())
-    (load,) = (f for f in found.findings if f.effect == HELD.name)
-    assert abs(load.parameters["m"] - twin.load_kg) < max(0.1, 4.0 * load.std["m"])
-    assert "external_wrench" not in {f.effect for f in found.findings}
-
-
-def test_a_load_that_plain_least_squares_weighs_otherwise_is_told_twice() -> None:
+def test_a_heavy_load_is_named_and_told_twice_where_plain_least_squares_weighs_otherwise() -> None:
     twin = next(t for t in map(draw_twin, TWINS) if t.load_kg > 2.0)
     screened = refuse((by_mujoco if twin.seed % 2 else by_pinocchio)(twin), documented())
-    load = find_gap([screened.log], documented())
-    (held,) = (f for f in load.findings if f.effect == HELD.name)
+    found = find_gap([screened.log], documented())
+    (held,) = (f for f in found.findings if f.effect == HELD.name)
+    assert abs(held.parameters["m"] - twin.load_kg) < max(0.1, 4.0 * held.std["m"])
+    assert "external_wrench" not in {f.effect for f in found.findings}
     other = replace(held, parameters=dict(held.parameters, m=held.parameters["m"] + 1.0))
     said = [
-        beside_plain(replace(load, findings=(x,)), screened, documented(), DOCUMENTED_SHARE).notes
+        beside_plain(replace(found, findings=(x,)), screened, documented(), DOCUMENTED_SHARE).notes
         for x in (held, other)
     ]
-    assert said[0] == load.notes and "by least squares" in said[1][0]
+    assert said[0] == found.notes and "by least squares" in said[1][0]
 
 
 def test_friction_of_large_joints_is_told_once() -> None:

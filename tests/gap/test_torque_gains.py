@@ -21,9 +21,9 @@ from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log, write_log
 from tests.benchmarks.lambda_trials import robots_folder
 from tests.helpers.driven_arm import JOINTS, LOAD_KG, currents, driven_arm, six_joints
+from tests.helpers.robot_models import shared
 
-SHARED = Path(__file__).parents[2].parent / "shared"
-BAGS = SHARED / "data" / "unisa_bags"
+BAGS = "data/unisa_bags"
 NAMES = six_joints().tree.joint_names
 # N m/A of a UR10's joints, as the maker of the bag states them (unisa-acg/inverse-dynamics-solver)
 UR10_GAINS = np.array([13.5841, 14.2959, 11.3716, 11.2408, 11.7681, 11.7682])
@@ -67,13 +67,13 @@ def test_newton_metres_pass(seed: int, load_kg: float) -> None:
 
 def kuka() -> tuple[Log, SelfModel]:
     names = tuple(f"lwr_{k}_joint" for k in range(7))
-    model = read_robot(SHARED / "data/lwr4/kuka_lwr4.urdf")
-    spec = ImportSpec({"": SHARED / "data/lwr4/measurements_1.npz"}, joint_names=names)
+    model = read_robot(shared("data/lwr4/kuka_lwr4.urdf"))
+    spec = ImportSpec({"": shared("data/lwr4/measurements_1.npz")}, joint_names=names)
     return replace(table_log(spec), joint_names=model.tree.joint_names), model
 
 
 def panda() -> tuple[Log, SelfModel]:
-    return read_log(BAGS / "panda_exciting_trajectory.db3"), read_robot("panda")
+    return read_log(shared(f"{BAGS}/panda_exciting_trajectory.db3")), read_robot("panda")
 
 
 def ur10() -> tuple[Log, SelfModel]:
@@ -81,10 +81,9 @@ def ur10() -> tuple[Log, SelfModel]:
     if folder is None:
         pytest.skip("example-robot-data is not installed (extra [robots])")
     model = read_robot(folder / "ur_description/urdf/ur10_robot.urdf")
-    return read_log(BAGS / "ur10_exciting_trajectory.db3"), model
+    return read_log(shared(f"{BAGS}/ur10_exciting_trajectory.db3")), model
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real logs are not beside the project")
 @pytest.mark.parametrize("arm", [kuka, panda, ur10])
 def test_real_logs_pass(arm) -> None:  # type: ignore[no-untyped-def]
     """The UR10's bag too: its friction and gravity are those of a UR10 in N m, not in A."""
@@ -94,7 +93,6 @@ def test_real_logs_pass(arm) -> None:  # type: ignore[no-untyped-def]
         check_torque(matching(replace(log, tau=log.tau / 10.0), model), model)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real logs are not beside the project")
 def test_a_real_arm_in_amperes() -> None:
     log, model = ur10()
     log = matching(log, model)

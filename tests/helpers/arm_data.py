@@ -132,6 +132,40 @@ def pin_tree(
     return model
 
 
+def free_answers(
+    model: pin.Model, signals: Sequence[np.ndarray], base: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What Pinocchio says of a tree on a free base, in a world without gravity.
+
+    Args:
+        model: of `pin_tree`; signals: q, dq, ddq (m, n) of the joints; base: v, w, a, dw (m, 3) in
+            its own axes, a without gravity, so that its pose is of no account.
+
+    Returns:
+        Base wrench and torques (m, 6 + n); v, w, a, dw (m, n, 4, 3) of the links; the largest
+        force (m,) between two bodies.
+    """
+    data, numbers = model.createData(), range(2, model.njoints)
+    places = [model.joints[k].idx_v for k in numbers]
+    tau, motion, force = [], [], []
+    for *joints, v, w, a, dw in zip(*signals, *base, strict=True):
+        q, speed, accel = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        q[[k + 1 for k in places]], speed[places], accel[places] = joints
+        # Pinocchio's spatial acceleration of the free flyer: d/dt of [v; w] in body axes
+        speed[:6], accel[:6] = [*v, *w], [*(a - np.cross(w, v)), *dw]
+        found = pin.rnea(model, data, q, speed, accel)
+        tau.append(np.concatenate([found[:6], found[places]]))
+        force.append(max(np.linalg.norm(data.f[k].linear) for k in numbers))
+        pin.forwardKinematics(model, data, q, speed, accel)
+        rows = []
+        for k in numbers:
+            twist = data.v[k]
+            felt = pin.getClassicalAcceleration(model, data, k, pin.LOCAL)
+            rows.append(np.stack([twist.linear, twist.angular, felt.linear, felt.angular]))
+        motion.append(np.stack(rows))
+    return np.array(tau), np.array(motion), np.array(force)
+
+
 def rnea(model: pin.Model, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
     """Torques (m, n) of tables (m, n)."""
     data = model.createData()

@@ -32,6 +32,11 @@ def write(path: Path | None, found: object) -> None:
         path.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
+def shown(row: Row) -> str:
+    """A row in one line, its numbers in four digits."""
+    return " ".join(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items())
+
+
 def told(
     rows: Iterable[Row], path: Path | None = None, line: Callable[[Row], str] = json.dumps
 ) -> list[Row]:

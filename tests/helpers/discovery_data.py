@@ -12,15 +12,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 
 from adapter.discovery import Discovery
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
 from drivers.files.mcap import Log
-from tests.helpers.arm_data import pin_tree
-from tests.helpers.robot_models import frame_motion, read_quietly, urdf_text
+from tests.helpers.arm_data import free_answers, pin_tree
+from tests.helpers.robot_models import read_quietly, urdf_text
 
 ENCODER_STEP = 2 * np.pi / 2**19  # rad
 GYRO = np.radians(0.007)  # rad/s/√Hz
@@ -96,23 +95,17 @@ def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[
         q[:, j], dq[:, j], ddq[:, j] = q[0, j], 0.0, 0.0
     _, speed, change = _sines(rng, t, 6, 0.6 if model.tree.floating else 0.0)
     frames = matrix_from_zxz(model.lam[:, :3]), model.lam[:, 3:]
-    arm = pin_tree(model.tree.parent, *frames, model.theta[-n:], model.gravity, free=True)
-    data = arm.createData()
-    pose = pin.neutral(arm)
-    twists, accels = (np.zeros((len(t), 1 + n, 6)) for _ in range(2))
-    tau = np.zeros((len(t), n))
-    v = np.zeros(arm.nv)
-    for k in range(len(t)):
-        pose[7:] = q[k]
-        rates, seconds = np.concatenate([speed[k], dq[k]]), np.concatenate([change[k], ddq[k]])
-        tau[k] = pin.rnea(arm, data, pose, rates, seconds)[6:]
-        pin.forwardKinematics(arm, data, pose, rates, seconds)
-        for b in range(1 + n):
-            seen = frame_motion(arm, data, b + 1, np.eye(3), model.gravity).ravel()
-            twists[k, b], accels[k, b] = seen[:6], seen[6:]
-        v[:6] = speed[k]
-        pose = pin.integrate(arm, pose, v / motion.rate_hz)
-    return q, dq, ddq, tau, twists, accels
+    arm = pin_tree(model.tree.parent, *frames, model.theta[-n:], np.zeros(3), free=True)
+    (v, w), (dv, dw), turn = np.split(speed, 2, axis=1), np.split(change, 2, axis=1), np.eye(3)
+    felt = dv + np.cross(w, v)
+    for a, spin in zip(felt, w, strict=True):
+        a -= model.gravity @ turn
+        turn = turn @ exp_rotation(spin / motion.rate_hz)
+    base = v, w, felt, dw
+    tau, links, _ = free_answers(arm, (q, dq, ddq), base)
+    seen = np.concatenate([np.stack(base, axis=1)[:, None], links], axis=1)
+    twists, accels = (x.reshape(len(t), 1 + n, 6) for x in (seen[:, :, :2], seen[:, :, 2:]))
+    return q, dq, ddq, tau[:, 6:], twists, accels
 
 
 def anyhow(

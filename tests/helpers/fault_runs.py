@@ -29,9 +29,6 @@ from tests.helpers.live_tools import simulated_arm
 
 N = 7
 SEED, FAULT_SEED = 5, 1
-SHARES = (0.001, 0.01, 0.1)
-SHARED = ("lost", "late", "repeated", "reordered", "corrupt", "nan", "spike")
-EVERY_SHARE = tuple(f"{name}={share}" for name in SHARED for share in SHARES)
 
 
 class Watched:
@@ -177,26 +174,3 @@ def difference(a: OnlineLearner, b: OnlineLearner) -> Difference:
         error_ratio=float(errors[1] / errors[0]),
         torque_nm=float(np.sqrt(np.mean(torque**2))),
     )
-
-
-def grid(texts: tuple[str, ...] = EVERY_SHARE, seconds: float = 15.0) -> list[str]:
-    """A line for each of these faults, for people; what the soak prints."""
-    lines = []
-    for text in texts:
-        run = run_faulty(text, seconds)
-        run.check_balance()
-        reached = run.result.samples
-        end = f"{run.result.ended}: {run.result.fault}" if run.result.fault else run.result.ended
-        apart = difference(clean_run(seconds).learner, run.learner)
-        changes = len(run.learner.changes)
-        lines.append(
-            f"{text}: {reached} samples, learned {run.learner.learned}, refused {run.refused}, "
-            f"{end}; {apart}; changes {changes}; finite {run.finite}"
-        )
-    return lines
-
-
-if __name__ == "__main__":
-    import sys
-
-    print("\n".join(grid(tuple(sys.argv[1:]) or EVERY_SHARE)))

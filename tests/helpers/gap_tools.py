@@ -7,16 +7,14 @@ arm does exactly what it was told; everything else is as in `sim.hidden`.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.signal import butter, sosfilt
 
 from drivers.files.mcap import Log
-from sim.hidden import Trial, draw, nominal_urdf
+from sim.hidden import Trial, draw
 from sim.hidden.motion import DrawnMotion, draw_motion
-from sim.hidden.record import log_of, write_files
+from sim.hidden.record import log_of
 from sim.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
 from sim.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM
 from sim.noise_levels import NoiseLevels
@@ -89,18 +87,3 @@ def pinocchio_recording(trial: Trial) -> Log:
     rubs = 0.0 if trial.friction is None else trial.friction.along(motion[1], 1e-3)
     q, dq, tau = sense(trial.arm, trial.effects, trial.times, *motion, rubs)
     return recorded(trial, q, dq, tau + trial.disturbance(), None)
-
-
-def pinocchio_trial(seed: int, kind: str) -> tuple[Log, str, dict[str, Any]]:
-    """Recording, nominal URDF and truth of a seed; see `sim.hidden.draw`."""
-    trial = draw(seed, kind)
-    truth = {**trial.as_dict(), "simulator": "pinocchio"}
-    return pinocchio_recording(trial), nominal_urdf(trial.nominal), truth
-
-
-def write_trial(
-    trial: tuple[Log, str, dict[str, Any]], folder: Path | str
-) -> tuple[Path, Path, Path]:
-    """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths."""
-    recording, urdf, truth = trial
-    return write_files(recording, urdf, truth, Path(folder))

@@ -11,8 +11,8 @@ from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.model.robots import documented
-from adapter.realtime.jobs import RecordingJob
-from adapter.realtime.loop import LiveOptions
+from adapter.realtime.jobs import Jobs, RecordingJob
+from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.realtime.shared import SharedBlock
 from adapter.realtime.supervisor import SharedMemoryOptions
 from adapter.signals.front_end import FrontEnd
@@ -97,6 +97,12 @@ class Swinging:
 
     def close(self) -> None:
         self.closes += 1
+
+
+def live(arm, options: LiveOptions, moving: bool = False, say=print, **jobs) -> LiveResult:
+    """A live run with new parts, in motion where asked for; workers by their name in `Jobs`."""
+    front_end, controller = swinging_parts() if isinstance(arm, Swinging) else parts()
+    return run_live(arm, front_end, controller if moving else None, Jobs(**jobs), options, say)
 
 
 def mapped_blocks(pid: int) -> list[str]:

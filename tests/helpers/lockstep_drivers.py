@@ -79,7 +79,7 @@ class FciLockstep:
         self._control.stop(lambda wait_s: self._tick())
 
     def close(self) -> None:
-        self.served.arm.close()
+        self.served.arm.plant.close()
 
     def _keep(self, datagram: bytearray) -> None:
         self._sent = bytes(datagram)
@@ -199,7 +199,7 @@ def opened(name: str, world: Scenario) -> Iterator[tuple[Driver, Obstacles]]:
             obstacles = plant._engine.obstacles
         elif name == "fci":
             driver = robot = FciLockstep(world)
-            obstacles = robot.served.arm._plant._engine.obstacles
+            obstacles = robot.served.arm.plant._engine.obstacles
             after.enter_context(in_place_of_time(torque_control, robot))
         else:
             driver, boards = on_line(world)

@@ -11,8 +11,8 @@ from adapter.learning.theta import neutral_body
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, rot_x, rot_y, rot_z, zxz_from_matrix
 from adapter.model.tree import Tree
-from sim.falls.fall import BASE, TreeLimits, TreeTruth
-from sim.truth import Array, theta_of, turn
+from sim.falls.fall import BASE, TreeTruth
+from sim.truth import Array, Limits, theta_of, turn
 
 MOST_JOINTS = 30
 ANY_ANGLE = 0.25  # share of frames that stand at any angle; the others at right angles
@@ -75,7 +75,7 @@ def random_tree(links: int, seed: int) -> TreeTruth:
     parent = tuple(int(rng.integers(max(BASE, k - NEAR), k)) for k in range(links))
     half = rng.uniform(*RANGE_RAD, links)
     middle = rng.uniform(-0.5, 0.5, links)
-    everywhere = np.ones(links)
+    speed, effort, free = (np.full(links, x) for x in (SPEED, EFFORT, np.inf))
     return TreeTruth(
         name=f"tree{links}",
         joint_names=tuple(f"joint{k + 1}" for k in range(links)),
@@ -85,7 +85,7 @@ def random_tree(links: int, seed: int) -> TreeTruth:
         R=np.array([_any_rotation(rng) for _ in range(links)]),
         p=REACH_M * rng.standard_normal((links, 3)),
         theta=np.array([_random_body(rng) for _ in range(links + 1)]),
-        limits=TreeLimits(middle - half, middle + half, SPEED * everywhere, EFFORT * everywhere),
+        limits=Limits(middle - half, middle + half, speed, effort, free),
         gravity=np.array(GRAVITY),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, rpy_from_matrix, z_to_axis
 from adapter.model.urdf import model_from_urdf
 from adapter.physics.networks import FrameMotion
+from drivers.files.mcap import Log
 
 SHARED = Path(__file__).parents[2].parent / "shared"
 PANDA = Path(__file__).parents[2] / "adapter" / "model" / "robots" / "panda.urdf"
@@ -46,6 +48,17 @@ def shared(relative: str) -> Path:
     if not path.exists():
         pytest.skip(f"{path} is not here: the shared folder stays with the project's makers")
     return path
+
+
+@cache
+def real_log() -> Log:
+    """A real Panda in motion (Gaz et al. 2019), as it was measured; skips the test likewise."""
+    folder = shared("data/panda_gaz2019")
+    names = ("time", "positions", "velocity", "torques")
+    t, *signals = (np.loadtxt(folder / f"exciting_traj_{name}.txt") for name in names)
+    stamps = np.round(1e9 * t).astype(np.int64)
+    joints = tuple(f"panda_joint{k}" for k in range(1, 8))
+    return Log(Path("real.mcap"), joints, stamps, *(x.reshape(-1, 7) for x in signals))
 
 
 def urdf_text(name: str) -> str:

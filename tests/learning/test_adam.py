@@ -56,14 +56,6 @@ def test_without_the_private_operator_the_numbers_are_the_same(monkeypatch, size
     assert plain.steps == fused.steps == 120 and np.abs(plain.parameters).min() > 0.0
 
 
-def test_no_gradient_no_step() -> None:
-    adam = FlatAdam(5, 1e-2, (0.9, 0.999))
-    adam.parameters[:] = np.arange(5)
-    for _ in range(10):
-        adam.step()
-    assert np.array_equal(adam.parameters, np.arange(5))
-
-
 def test_forgetting_a_part_leaves_the_rest() -> None:
     adam = FlatAdam(4, 1e-2, (0.9, 0.999))
     adam.gradient[:] = 1.0

@@ -12,10 +12,7 @@ import torch
 
 from adapter.errors import ModelError
 from adapter.experiments.networks import NetworkSettings, schema_by_networks
-from adapter.learning.batch.prediction_errors import (
-    kinematic_errors,
-    predicted_torques,
-)
+from adapter.learning.batch.prediction_errors import kinematic_errors, predicted_torques
 from adapter.learning.batch.schema import schema_from_moments
 from adapter.learning.batch.theta import learn_theta
 from adapter.learning.tree_data import BodyMotion, TreeData

@@ -130,40 +130,6 @@ def test_no_descent_gets_below_the_conic_solution(seed: int) -> None:
     assert found.cost < 1.0001 * best and best < 1.05 * found.cost
 
 
-@pytest.mark.parametrize("links", [5, 9])
-def test_exact_data_give_exact_bodies_and_leave_them_room(links: int) -> None:
-    """Of a tree's samples with true frames: nothing is lost, also where one joint rests."""
-    for seed in range(3):
-        model, data = samples(random_urdf(links, seed), True, 100, seed)
-        for still in (False, True):
-            known = data
-            if still:
-                at_rest = [x.copy() for x in (data.q, data.dq, data.ddq)]
-                at_rest[0][:, 2], at_rest[1][:, 2], at_rest[2][:, 2] = 0.3, 0.0, 0.0
-                q, dq, ddq = at_rest
-                known = replace(data, q=q, dq=dq, ddq=ddq, links=None)
-                known = replace(known, tau=predicted_torques(known, model.lam, model.theta))
-            found = learn_theta(known, model.lam)
-            gap = predicted_torques(known, model.lam, found.theta) - known.tau
-            assert np.abs(gap).max() < 1e-9 * np.abs(known.tau).max()
-            assert found.min_eigenvalue > 1e-7
-
-
-def test_impossible_least_squares_are_kept_out() -> None:
-    """Noise makes least squares leave what can exist; possible bodies fit as well as they can."""
-    model, data = samples(random_urdf(6, 18), True, 60, 18)
-    rng = np.random.default_rng(3)
-    noisy = replace(data, tau=data.tau + 5.0 * rng.normal(size=data.tau.shape))
-    free = learn_theta(noisy, model.lam, possible=False)
-    held = learn_theta(noisy, model.lam)
-    assert min_eigenvalue(free.theta).min() < 0.0 < held.min_eigenvalue
-    truth = [
-        np.sqrt(np.mean((predicted_torques(data, model.lam, x) - data.tau) ** 2))
-        for x in (held.theta, free.theta)
-    ]
-    assert truth[0] < truth[1]  # what is known to be possible keeps noise out
-
-
 def test_a_solver_that_stops_early_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its bodies are possible all the same."""
     rng = np.random.default_rng(6)
@@ -203,7 +169,7 @@ def test_relative_error_is_that_of_the_paper() -> None:
 
 def test_errors_summed_up_are_those_of_the_samples() -> None:
     model, data = samples(random_urdf(5, 27), True, 40, 27)
-    lam, theta = model.lam + 0.01, 1.1 * model.theta
+    lam = model.lam + 0.01
     joints = tuple(map(torch.from_numpy, data.joints()))
     k = link_motion(data.tree, torch.from_numpy(lam), joints, FrameMotion.of(data.base.rows()))
     found = kinematic_errors(data, lam)
@@ -211,13 +177,6 @@ def test_errors_summed_up_are_those_of_the_samples() -> None:
         gap = np.abs(getattr(k, name)[:, 1:].numpy() - getattr(data.links, name))
         np.testing.assert_allclose(by_link, gap.max(axis=(0, 2)), rtol=1e-9)
         assert found.largest[name] == by_link.max()
-    error = torque_errors(data, lam, theta)
-    tau = predicted_torques(data, lam, theta)[:, 6:]
-    every = np.sort(relative_errors(data.tau[:, 6:], tau).ravel())
-    every = every[np.isfinite(every)]
-    assert error.median == pytest.approx(np.quantile(every, 0.5))
-    assert error.p99 == pytest.approx(np.quantile(every, 0.99)) and error.p99 > 2 * error.median
-    np.testing.assert_allclose(error.rmse, np.sqrt(np.mean((tau - data.tau[:, 6:]) ** 2, axis=0)))
 
 
 @pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])

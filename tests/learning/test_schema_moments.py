@@ -95,19 +95,6 @@ def test_cost_gradient_and_curvature_are_those_of_the_samples(ch: int, seed: int
     assert np.allclose(H, H.T, rtol=0, atol=1e-12 * np.abs(H).max())
 
 
-@pytest.mark.parametrize("ch", CHANNELS)
-def test_gradient_and_curvature_are_added_to_what_is_there(ch: int) -> None:
-    """The curvature is left out where there is no room for it."""
-    data = Data(0)
-    cost, g, H = data.cost(ch)
-    more_g, more_H = np.ones(6), np.ones((6, 6))
-    channel_cost(data.M, ch, data.R, data.p, more_g, more_H)
-    assert np.allclose(more_g, 1.0 + g, rtol=1e-12, atol=1e-9)
-    assert np.allclose(more_H, 1.0 + H, rtol=1e-12, atol=1e-9)
-    bare, without, _ = data.cost(ch, curved=False)
-    assert bare == cost and np.array_equal(without, g)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("keep", [1.0, 0.9])
 def test_moments_are_sums_over_samples_that_fade(seed: int, keep: float) -> None:

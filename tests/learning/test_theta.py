@@ -6,8 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from adapter.effects import effects_by_name
-from adapter.effects.by_joint import JointSignals
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.model.inertia import min_eigenvalue
@@ -172,16 +170,6 @@ def test_effects_are_told_in_the_model() -> None:
     q, dq, ddq, tau = fresh.true
     noise = np.sqrt(learner.theta.variance())
     assert (rms(tau - ModelTorque(model)(q, dq, ddq)) < 3.0 * noise).all()
-
-
-def test_effects_have_the_columns_they_say() -> None:
-    q, dq, ddq = np.random.default_rng(0).normal(size=(3, 5, N))
-    viscous, coulomb, offset, motor = effects_by_name(FRICTION)
-    at = JointSignals(q, dq, ddq)
-    assert np.array_equal(viscous.column(at), dq)
-    assert np.allclose(coulomb.column(JointSignals(q, 10 * dq, ddq)), np.sign(dq), atol=0.3)
-    assert (offset.column(at) == 1.0).all()
-    assert np.array_equal(motor.column(at), ddq)
 
 
 TOOL = Tool(1.2, np.array([0.02, -0.01, 0.15]), np.diag([0.004, 0.004, 0.002]))

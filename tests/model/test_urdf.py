@@ -120,15 +120,6 @@ def test_joints_not_asked_for_are_locked() -> None:
     assert model.theta[:, 0].sum() + model.base_theta[0] == pytest.approx(total)
 
 
-def test_mimic_joints_are_locked() -> None:
-    text = PANDA.read_text().replace(
-        '<joint name="panda_joint7" type="revolute">',
-        '<joint name="panda_joint7" type="revolute"><mimic joint="panda_joint6"/>',
-    )
-    with pytest.warns(ModelWarning, match="panda_joint7.*mimics panda_joint6, .*; locked at zero"):
-        assert model_from_urdf(text).tree.n == 6
-
-
 @pytest.mark.parametrize(
     ("robot", "free"), [("rail", 7), ("scara", 4), ("gantry", 4), ("gripper", 4)]
 )

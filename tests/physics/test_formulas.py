@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics import kernels, networks
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of
@@ -123,12 +122,6 @@ def randoms(request: pytest.FixtureRequest) -> list[Random]:
     return [Random(seed, *request.param) for seed in SEEDS]
 
 
-def test_the_random_trees_branch(randoms: list[Random]) -> None:
-    children = [max(r.tree.parent.count(i) for i in range(-1, r.tree.n)) for r in randoms]
-    roots = [r.tree.parent.count(-1) for r in randoms]
-    assert max(children) > 1 and max(roots) > 1 and max(r.tree.n for r in randoms) > 6
-
-
 def test_compiled_link_motion_is_the_networks(randoms: list[Random]) -> None:
     for r in randoms:
         out = np.full(r.motion.shape, np.nan)
@@ -193,13 +186,6 @@ def test_compiled_transfer_of_wrenches_is_the_networks() -> None:
             expected, torch.from_numpy(q[j : j + 1]), torch.from_numpy(lam[j])
         )
     assert relative(out, expected[0]) < 1e-13
-
-
-def test_rotation_of_numpy_and_torch_agree() -> None:
-    angles = np.random.default_rng(0).uniform(-4, 4, (20, 3))
-    lam = torch.from_numpy(np.hstack([angles, np.zeros((20, 3))]))
-    found = networks.joint_rotation(lam).numpy()
-    np.testing.assert_allclose(found, matrix_from_zxz(angles), atol=1e-14)
 
 
 def fixed_case(name: str) -> tuple[Case, SelfModel, list[np.ndarray]]:

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adapter.realtime import real_time
-from adapter.realtime.real_time import Clock, sleep_until
+from adapter.realtime.real_time import Clock
 from adapter.realtime.timing import Histogram, Timing
+from drivers.process import sleep_until
 
 PERIOD = 1_000_000
 

@@ -132,9 +132,7 @@ def test_every_update_fades_in(board):
     steps = np.abs(np.diff(np.vstack([before, said]), axis=0))
     whole = np.abs(said[-1] - before)
     assert (steps.max(axis=0) <= whole / 400 + 1e-9).all() and whole.max() > 5.0
-    heavy = PANDA.theta.copy()
-    heavy[-1, 0] += 2.0
-    expected = ModelFeedforward.of(replace(PANDA, theta=heavy))(Q, DQ, DDQ)
+    expected = ModelFeedforward.of(replace(PANDA, theta=loaded(2.0).theta))(Q, DQ, DDQ)
     np.testing.assert_allclose(said[-1], expected, atol=1e-9)
     assert not forward.notes
     forward.detach()
@@ -168,16 +166,12 @@ def test_the_bound_is_set_by_a_load_friction_and_the_standard_deviation():
     np.testing.assert_allclose(lost, 2.0 * sure)
 
 
-def test_a_false_load_in_a_motion_stays_within_the_bound_and_the_motion_goes_on() -> None:
+def test_a_false_load_in_a_motion_stays_within_the_bound_and_the_motion_goes_on(board) -> None:
     """20 kg too many are published while an embedded arm moves by what was learned before."""
     limits, documented_model = MotionLimits.of(PANDA), ModelFeedforward.of(PANDA)
     bound, forward = FeedforwardBound(PANDA, ModelFeedforward.of(PANDA)), bounded()
-    heavy = PANDA.theta.copy()
-    heavy[-1, 0] += 20.0
-    known = replace(nothing_known(N, N, 0), lam=PANDA.lam, lam_converged=True, theta_converged=True)
     none = np.zeros((N, 10))
-    board = SnapshotWriter.create(PANDA.tree.joint_names, name=None)
-    board.publish(replace(known, theta=PANDA.theta, theta_std=none))
+    board.publish(loaded(0.0))
     forward.attach(board.name)
     controller = ExcitationController(limits, None, None, forward, expected=documented_model)
     gains, ticks, beyond, share = ControlSettings().gains(limits), 0, 0.0, 0.0
@@ -186,7 +180,7 @@ def test_a_false_load_in_a_motion_stays_within_the_bound_and_the_motion_goes_on(
         nonlocal ticks, beyond, share
         ticks += 1
         if ticks == 1500:
-            board.publish(replace(known, theta=heavy, theta_std=none))
+            board.publish(loaded(20.0))
         ref = controller.reference
         if ticks < 1200 or tau is None or ref is None:
             return
@@ -201,8 +195,6 @@ def test_a_false_load_in_a_motion_stays_within_the_bound_and_the_motion_goes_on(
     finally:
         arm.close()
         controller.detach()
-        board.close()
-        board.unlink()
     assert result.fault is None and result.tracking is not None
     assert "fell back" in result.tracking["notes"][0]
     assert result.samples > 3000 and share < 1.0

@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.realtime.jobs import Jobs
-from adapter.realtime.loop import run_live
-from adapter.realtime.real_time import sleep_until
+from adapter.realtime.loop import LiveOptions
 from adapter.realtime.session import Session, run_lockstep
 from adapter.realtime.showing import DisplayJob
 from adapter.realtime.worker import WorkerError
 from drivers.files.mcap import read_estimates, read_log
 from drivers.interface import DriverError
+from drivers.process import sleep_until
 from tests.helpers import live_tools as tools
 
 pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]
@@ -30,15 +29,9 @@ if __name__ == "__main__":  # the workers load this file as well, and need none 
     import sys
     from pathlib import Path
     from tests.helpers import live_tools as tools
-    from adapter.realtime.jobs import Jobs
-    from adapter.realtime.loop import run_live
 
-    front_end, controller = tools.parts()
-    run_live(
-        tools.simulated_arm(), front_end, controller=controller,
-        jobs=Jobs(learner=tools.learner_job(), recording=tools.recording_job(Path(sys.argv[1]))),
-        options=tools.live_options(None),
-    )
+    jobs = dict(learner=tools.learner_job(), recording=tools.recording_job(Path(sys.argv[1])))
+    tools.live(tools.simulated_arm(), tools.live_options(None), moving=True, **jobs)
 """
 
 
@@ -58,18 +51,14 @@ def _diary(path: Path) -> list[list[str]]:
 def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_CHECKPOINT", str(tmp_path / "checkpoint"))
     monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
-    front_end, controller = tools.parts()
     path, diary = tmp_path / "a.mcap", tmp_path / "diary"
-    result = run_live(
+    result = tools.live(
         tools.simulated_arm(),
-        front_end,
-        controller=controller,
-        jobs=Jobs(
-            learner=tools.learner_job(save=tools.save_count),
-            recording=tools.recording_job(path),
-            display=DisplayJob(tools.Diary, period_s=0.05),
-        ),
-        options=replace(tools.live_options(2.0), before_motion=partial(_wait_for_display, diary)),
+        replace(tools.live_options(2.0), before_motion=partial(_wait_for_display, diary)),
+        moving=True,
+        learner=tools.learner_job(save=tools.save_count),
+        recording=tools.recording_job(path),
+        display=DisplayJob(tools.Diary, period_s=0.05),
     )
     print("\n".join(result.timing.lines()))
     assert (result.ended, result.fault, result.troubles) == ("duration", None, [])
@@ -103,14 +92,8 @@ def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch
 @pytest.mark.parametrize("fault", [{"fail_read": 700}, {"fail_command": 700}])
 def test_a_driver_that_fails_is_stopped_and_all_is_kept(tmp_path, fault):
     arm, path = tools.Swinging(**fault), tmp_path / "a.mcap"
-    front_end, controller = tools.swinging_parts()
-    result = run_live(
-        arm,
-        front_end,
-        controller=controller,
-        jobs=Jobs(learner=tools.learner_job(), recording=tools.recording_job(path)),
-        options=tools.live_options(30.0),
-    )
+    jobs = {"learner": tools.learner_job(), "recording": tools.recording_job(path)}
+    result = tools.live(arm, tools.live_options(30.0), moving=True, **jobs)
     assert result.ended == "driver_error"
     assert result.fault in ("the cable came off", "the arm refused")
     assert arm.stops == 1 and arm.closes == 1
@@ -120,7 +103,7 @@ def test_a_driver_that_fails_is_stopped_and_all_is_kept(tmp_path, fault):
 
 def test_passive_only_listens_and_needs_no_workers():
     arm = tools.Swinging()
-    result = run_live(arm, tools.parts()[0], options=tools.live_options(0.3))
+    result = tools.live(arm, tools.live_options(0.3))
     assert (result.ended, arm.commands, result.tracking) == ("duration", 0, None)
     assert result.samples == 301 and result.recorded is None and result.collected is None
 
@@ -141,12 +124,12 @@ class Paced(tools.Swinging):
 
 def test_every_sample_is_accounted_for_and_its_age_is_told():
     arm = Paced()
-    result = run_live(arm, tools.parts()[0], options=tools.live_options(0.5))
+    result = tools.live(arm, tools.live_options(0.5))
     assert result.samples + result.set_aside == result.intake.received == arm.reads
     assert result.intake == arm.intake and result.intake is not arm.intake
     assert result.timing.age_us["p50"] >= 1000.0
     assert any("age of a sample" in line for line in result.timing.lines())
-    unpaced = run_live(tools.Swinging(), tools.parts()[0], options=tools.live_options(0.2))
+    unpaced = tools.live(tools.Swinging(), tools.live_options(0.2))
     assert unpaced.timing.age_us["p50"] is None and unpaced.set_aside == 0
 
 
@@ -178,18 +161,14 @@ def test_a_learner_that_dies_stops_neither_arm_nor_display(tmp_path, monkeypatch
     monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
     lines: list[str] = []
     path, diary = tmp_path / "a.mcap", tmp_path / "diary"
-    front_end, controller = tools.swinging_parts()
-    result = run_live(
+    result = tools.live(
         tools.Swinging(),
-        front_end,
-        controller,
-        jobs=Jobs(
-            learner=tools.learner_job(kind),
-            recording=tools.recording_job(path) if kind is tools.Dying else None,
-            display=DisplayJob(tools.Diary, period_s=0.05),
-        ),
-        options=replace(tools.live_options(1.0), before_motion=partial(_wait_for_display, diary)),
+        replace(tools.live_options(1.0), before_motion=partial(_wait_for_display, diary)),
+        moving=True,
         say=lines.append,
+        learner=tools.learner_job(kind),
+        recording=tools.recording_job(path) if kind is tools.Dying else None,
+        display=DisplayJob(tools.Diary, period_s=0.05),
     )
     assert result.ended == "duration" and result.samples > 1000
     assert result.collected is None and result.passed_on + result.unlearned > 500
@@ -204,23 +183,14 @@ def test_what_cannot_start_says_so_and_leaves_nothing(tmp_path):
     path.write_bytes(b"precious")
     arm = tools.Swinging()
     with pytest.raises(DriverError, match="exists"):
-        run_live(
-            arm,
-            tools.parts()[0],
-            jobs=Jobs(recording=tools.recording_job(path)),
-        )
+        tools.live(arm, LiveOptions(), recording=tools.recording_job(path))
     assert path.read_bytes() == b"precious"
     job = tools.learner_job(tools.no_learner)
     with pytest.raises(WorkerError, match="no such model"):
-        run_live(
-            arm,
-            tools.parts()[0],
-            jobs=Jobs(learner=job),
-            options=tools.live_options(1.0),
-        )
+        tools.live(arm, tools.live_options(1.0), learner=job)
     arm.can_move = False
     with pytest.raises(DriverError, match="passive"):
-        run_live(arm, tools.parts()[0], controller=tools.parts()[1])
+        tools.live(arm, LiveOptions(), moving=True)
 
 
 @pytest.fixture

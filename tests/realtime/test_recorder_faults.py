@@ -19,8 +19,6 @@ import pytest
 from adapter.cli.common import recording_metadata
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import main
-from adapter.realtime.jobs import Jobs
-from adapter.realtime.loop import run_live
 from drivers.files.mcap import read_log
 from tests.helpers import live_tools as tools
 
@@ -75,15 +73,9 @@ def _in_the_middle(path: Path, act) -> None:
 def _run(path: Path, spring=None, ring_s: float = 5.0, duration_s: float = RUN_S):
     arm = Shaky()
     metadata = {"note": "test" if spring is None else Trap(spring, path)}
-    result = run_live(
-        arm,
-        tools.parts()[0],
-        jobs=Jobs(
-            learner=tools.learner_job(),
-            recording=replace(tools.recording_job(path), metadata=metadata),
-        ),
-        options=tools.live_options(duration_s, ring_s),
-    )
+    recording = replace(tools.recording_job(path), metadata=metadata)
+    options = tools.live_options(duration_s, ring_s)
+    result = tools.live(arm, options, learner=tools.learner_job(), recording=recording)
     assert (result.ended, result.fault) == ("duration", None) and arm.stops == 1
     assert result.samples == round(1e3 * duration_s) + 1
     assert result.samples == result.recorded + result.unrecorded

@@ -280,12 +280,8 @@ def test_a_bug_in_a_tick_stops_the_arm_and_closes_the_recording(tmp_path, where)
 
 def test_a_driver_that_cannot_stop_is_told_and_all_is_kept(tmp_path):
     path = tmp_path / "a.mcap"
-    result = run_live(
-        Broken("stop"),
-        tools.parts()[0],
-        jobs=Jobs(recording=tools.recording_job(path)),
-        options=tools.live_options(0.5),
-    )
+    recording = tools.recording_job(path)
+    result = tools.live(Broken("stop"), tools.live_options(0.5), recording=recording)
     assert (result.ended, result.fault) == ("driver_error", "the cable came off")
     assert result.recorded == result.samples == len(read_log(path))
 

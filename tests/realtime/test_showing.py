@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from adapter.realtime import SnapshotReader, SnapshotWriter
-from adapter.realtime.jobs import Jobs
-from adapter.realtime.loop import run_live
 from adapter.realtime.ring import Ring
 from adapter.realtime.showing import DisplayJob, Looker
 from adapter.realtime.snapshot import NEWS_BYTES
@@ -140,16 +138,13 @@ def test_a_view_that_is_killed_is_followed_and_the_loop_loses_nothing(
     killer.start()
     stopper = threading.Thread(target=stop_when_followed)
     stopper.start()
-    result = run_live(
+    result = tools.live(
         tools.Swinging(),
-        tools.parts()[0],
-        jobs=Jobs(
-            learner=tools.learner_job(),
-            display=DisplayJob(partial(tools.Lines, tmp_path / "lines"), period_s=0.02, says=True),
-            view=DisplayJob(partial(tools.Witness, tmp_path), period_s=0.02),
-        ),
-        options=options,
+        options,
         say=said.append,
+        learner=tools.learner_job(),
+        display=DisplayJob(partial(tools.Lines, tmp_path / "lines"), period_s=0.02, says=True),
+        view=DisplayJob(partial(tools.Witness, tmp_path), period_s=0.02),
     )
     done.set()
     stopper.join()
@@ -167,13 +162,8 @@ def test_a_view_that_is_killed_is_followed_and_the_loop_loses_nothing(
 
 def test_a_view_that_cannot_start_is_no_reason_not_to_run() -> None:
     said: list[str] = []
-    result = run_live(
-        tools.Swinging(),
-        tools.parts()[0],
-        jobs=Jobs(learner=tools.learner_job(), view=DisplayJob(tools.no_view)),
-        options=tools.live_options(0.2),
-        say=said.append,
-    )
+    jobs = {"learner": tools.learner_job(), "view": DisplayJob(tools.no_view)}
+    result = tools.live(tools.Swinging(), tools.live_options(0.2), say=said.append, **jobs)
     assert (result.ended, result.samples) == ("duration", 201)
     assert result.troubles == said[:1] and "the page cannot be drawn" in said[0]
 

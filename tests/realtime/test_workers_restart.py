@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.realtime.jobs import Jobs
-from adapter.realtime.loop import run_live
 from adapter.realtime.session import run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.live import learner_job, single_thread_learner
@@ -34,13 +32,8 @@ def _whole(duration_s: float):
 def test_a_killed_learner_is_followed_by_one_that_learns_what_it_would_have(monkeypatch):
     monkeypatch.setenv("TEST_DEATHS", "700 1900")
     lines: list[str] = []
-    result = run_live(
-        tools.Swinging(),
-        tools.parts()[0],
-        jobs=Jobs(learner=tools.lasting_job(tools.Mortal)),
-        options=tools.live_options(RUN_S),
-        say=lines.append,
-    )
+    job, options = tools.lasting_job(tools.Mortal), tools.live_options(RUN_S)
+    result = tools.live(tools.Swinging(), options, say=lines.append, learner=job)
     print("\n".join(result.timing.lines()))
     assert (result.ended, result.fault) == ("duration", None)
     assert (result.restarts, result.skipped, result.unlearned) == (2, 0, 0)
@@ -52,12 +45,8 @@ def test_a_killed_learner_is_followed_by_one_that_learns_what_it_would_have(monk
 
 def test_one_that_dies_at_the_very_end_is_followed_as_well(monkeypatch):
     monkeypatch.setenv("TEST_DEATHS", str(_whole(1.0)[0]))
-    result = run_live(
-        tools.Swinging(),
-        tools.parts()[0],
-        jobs=Jobs(learner=tools.lasting_job(tools.Mortal)),
-        options=tools.live_options(1.0),
-    )
+    job = tools.lasting_job(tools.Mortal)
+    result = tools.live(tools.Swinging(), tools.live_options(1.0), learner=job)
     assert (result.restarts, result.skipped) == (1, 0) and result.collected == _whole(1.0)
 
 
@@ -67,12 +56,8 @@ def _disk_full(learner, folder: Path) -> None:
 
 def test_what_nobody_can_learn_any_more_is_counted(monkeypatch):
     monkeypatch.setenv("TEST_DEATHS", "1500")
-    result = run_live(
-        tools.Swinging(),
-        tools.parts()[0],
-        jobs=Jobs(learner=replace(tools.lasting_job(tools.Mortal), keep=_disk_full)),
-        options=tools.live_options(2.0, ring_s=1.0),
-    )
+    job = replace(tools.lasting_job(tools.Mortal), keep=_disk_full)
+    result = tools.live(tools.Swinging(), tools.live_options(2.0, ring_s=1.0), learner=job)
     learned, in_order, _ = result.collected
     assert result.restarts == 1 and result.skipped > 500 and in_order
     assert learned + result.skipped == result.passed_on
@@ -80,13 +65,9 @@ def test_what_nobody_can_learn_any_more_is_counted(monkeypatch):
 
 
 def test_one_that_always_dies_is_given_up(tmp_path):
-    path = tmp_path / "a.mcap"
-    result = run_live(
-        tools.Swinging(),
-        tools.parts()[0],
-        jobs=Jobs(learner=tools.lasting_job(tools.Dying), recording=tools.recording_job(path)),
-        options=tools.live_options(1.0),
-    )
+    jobs = {"learner": tools.lasting_job(tools.Dying)}
+    jobs["recording"] = tools.recording_job(tmp_path / "a.mcap")
+    result = tools.live(tools.Swinging(), tools.live_options(1.0), **jobs)
     assert result.restarts == 3 and result.collected is None
     assert len(result.troubles) == 4 and "nothing more is learned" in result.troubles[-1]
     assert result.ended == "duration" and result.recorded == result.samples
@@ -111,15 +92,8 @@ def test_the_real_learner_goes_on_bit_for_bit(monkeypatch):
     settings, duration_s = PipelineSettings(), 4.0
     job = learner_job(tools.PANDA, settings)
     job = replace(job, make=partial(_mortal_learner, tools.PANDA, settings), save_s=1.0)
-    front_end, controller = tools.parts()
     options = tools.live_options(duration_s, ring_s=60.0)
-    result = run_live(
-        tools.simulated_arm(),
-        front_end,
-        controller=controller,
-        jobs=Jobs(learner=job),
-        options=options,
-    )
+    result = tools.live(tools.simulated_arm(), options, moving=True, learner=job)
     assert (result.ended, result.restarts, result.skipped) == ("duration", 1, 0)
 
     whole = single_thread_learner(tools.PANDA, settings, None)

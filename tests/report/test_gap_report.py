@@ -29,12 +29,7 @@ from adapter.report.gap_panels import shown_joints
 from adapter.report.html import write_whole
 from adapter.runs.run_folder import RunFolderError
 from tests.helpers import gap_results as made_up
-from tests.helpers.browser import (
-    ids_of_a_whole_page,
-    laid_out,
-    shown_without_complaint,
-    text_of,
-)
+from tests.helpers.browser import ids_of_a_whole_page, laid_out, shown_without_complaint, text_of
 
 KINDS = ["one_finding", "pair", "unexplained", "nothing", "problem", "two_joints", "many"]
 SECTIONS = {

@@ -33,12 +33,7 @@ from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data,
 from adapter.runs.score import Course, figures, reference_from
 from sim.plant import SimulatedArm
 from sim.scenarios import build
-from tests.helpers.browser import (
-    ids_of_a_whole_page,
-    laid_out,
-    shown_without_complaint,
-    text_of,
-)
+from tests.helpers.browser import ids_of_a_whole_page, laid_out, shown_without_complaint, text_of
 
 PERCENTILES = {"p50": 90.0, "p99": 140.0, "p99.9": 200.0, "max": 900.0}
 SECTIONS = (  # worth, trust, what to do; then details in the order in which they are of use

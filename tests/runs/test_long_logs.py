@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.linalg
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.torque import ModelTorque
 from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -31,6 +29,7 @@ from adapter.signals import validation
 from adapter.signals.matching import matching, most_moved
 from drivers.files.mcap import Log, mapped
 from drivers.interface import Array
+from tests.helpers.long_arm import log_of
 
 SETTINGS = PipelineSettings(learner=LearnerSettings(effects=REAL_ARM_EFFECTS))
 
@@ -43,19 +42,7 @@ def panda() -> SelfModel:
 @cache
 def moving(seconds: float, seed: int) -> Log:
     """The documented arm with friction on three sines a joint, and the sensors' noise."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(1000 * seconds)) * 1e-3
-    signals = np.zeros((3, len(t), 7))
-    signals[0] = (0.0, -0.6, 0.0, -1.9, 0.0, 1.7, 0.7)
-    for cycles in (2, 5, 11):
-        w, size = 2.0 * np.pi * cycles / 10.0, 0.3 / cycles * rng.uniform(0.6, 1.0, 7)
-        phase = w * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, 7)
-        signals += np.array([np.sin(phase), w * np.cos(phase), -(w**2) * np.sin(phase)]) * size
-    q, dq, ddq = signals
-    tau = ModelTorque(panda())(q, dq, ddq) + 0.3 * dq + 0.6 * np.tanh(dq / 0.01)
-    noisy = (x + s * rng.standard_normal(x.shape) for x, s in ((q, 1e-5), (dq, 1e-3), (tau, 0.02)))
-    stamps = 10**9 + np.arange(len(t)) * 10**6
-    return Log(Path("arm.mcap"), panda().tree.joint_names, stamps, *noisy)
+    return log_of(seconds, seed=seed)
 
 
 def in_file(log: Log) -> Log:

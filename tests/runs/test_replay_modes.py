@@ -25,6 +25,7 @@ from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
 
 N = 7
+NAMES = tuple(f"panda_joint{k + 1}" for k in range(N))
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 
 
@@ -164,15 +165,17 @@ def test_progress_is_told() -> None:
         assert told == sorted(told) and told[-1] < 2500
 
 
-def test_names_in_another_order_are_put_in_order() -> None:
-    log = data().log()
+def test_joints_and_links_in_another_order_are_put_in_order() -> None:
+    log = data(links=True).log()
     order = [3, 0, 6, 1, 5, 2, 4]
     names = tuple(log.joint_names[k] for k in order)
     parts = {key: getattr(log, key)[:, order] for key in ("q", "dq", "tau")}
-    mixed = replace(log, joint_names=names, **parts)
+    parts |= {key: getattr(log, key)[:, ::-1] for key in ("twists", "accels")}
+    mixed = replace(log, joint_names=names, link_names=log.link_names[::-1], **parts)
     found = matching(mixed, panda_model())
     assert found.joint_names == panda_model().tree.joint_names
-    assert np.array_equal(found.q, log.q) and np.array_equal(found.tau, log.tau)
+    for key in ("q", "tau", "twists", "accels"):
+        assert np.array_equal(getattr(found, key), getattr(log, key))
     assert not found.warnings
 
 
@@ -186,25 +189,17 @@ def test_another_prefix_means_the_same_joints_with_a_warning() -> None:
 
 
 @pytest.mark.parametrize(
-    "names",
+    ("names", "said"),
     [
-        ("a", "b", "c", "d", "e", "f", "g"),
-        ("j1", "j2", "j3", "j4", "j5", "j6", "k6"),
-        ("x0", "x1", "x2", "x3", "x4", "x5", "x6"),
+        ("a b c d e f g", "panda_joint1, .*it has a, b, .*; panda"),
+        ("j1 j2 j3 j4 j5 j6 k6", "panda_joint1, .*it has j1, "),
+        ("x0 x1 x2 x3 x4 x5 x6", "panda_joint1, .*it has x0, "),
+        (f"{' '.join(NAMES[:4])} gripper {' '.join(NAMES[5:])}", "panda_joint5; it has .*gripper"),
     ],
 )
-def test_names_that_say_nothing_are_refused(names: tuple[str, ...]) -> None:
-    with pytest.raises(DriverError) as refused:
-        matching(replace(data().log(), joint_names=names), panda_model())
-    assert "arm_data.mcap: has no joint" in str(refused.value)
-    assert names[0] in str(refused.value) and "panda_joint7" in str(refused.value)
-
-
-def test_a_missing_joint_is_named() -> None:
-    log = data().log()
-    names = (*log.joint_names[:4], "gripper", *log.joint_names[5:])
-    with pytest.raises(DriverError, match=r"has no joint panda_joint5; it has .*gripper.*; panda"):
-        matching(replace(log, joint_names=names), panda_model())
+def test_names_that_say_nothing_or_lack_a_joint_are_refused(names: str, said: str) -> None:
+    with pytest.raises(DriverError, match=rf"arm_data\.mcap: has no joint {said}"):
+        matching(replace(data().log(), joint_names=tuple(names.split())), panda_model())
 
 
 def test_extra_joints_are_ignored_with_a_warning() -> None:
@@ -225,15 +220,6 @@ def test_motion_of_some_links_is_not_enough() -> None:
     assert not found.link_names and found.twists.shape[1] == 0
     outcome = replay(found, panda_model(), settings()).outcome
     assert not outcome.lam_measured and np.isfinite(outcome.lam).all()
-
-
-def test_links_in_another_order_are_put_in_order() -> None:
-    log = data(links=True).log()
-    mixed = replace(
-        log, link_names=log.link_names[::-1], twists=log.twists[:, ::-1], accels=log.accels[:, ::-1]
-    )
-    found = matching(mixed, panda_model())
-    assert np.array_equal(found.twists, log.twists) and np.array_equal(found.accels, log.accels)
 
 
 @pytest.mark.parametrize("every", [1, 10])

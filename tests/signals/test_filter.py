@@ -124,16 +124,6 @@ def test_repeated_and_missing_samples_change_nothing_on_a_straight_line(seed: in
     assert np.abs(dy[late] - slope).max() < 1e-9
 
 
-def test_delay_is_constant_and_as_stated() -> None:
-    joint_filter = JointFilter()
-    assert joint_filter.delay_s == joint_filter.gains.k1 / joint_filter.gains.k2
-    assert joint_filter.gains.delay_ns == round(1e9 * joint_filter.delay_s)
-    hz = np.array([0.01, 0.1, 0.5, 1.0, 2.0])
-    delay = -np.angle(transfer(joint_filter, hz)) / (2 * np.pi * hz)
-    assert np.abs(delay[:2] - joint_filter.delay_s).max() < 1e-5
-    assert np.abs(delay - joint_filter.delay_s).max() < 2e-3  # the corner is at 6 Hz
-
-
 def test_start_and_reset_settle_at_rest() -> None:
     gains, state = JointFilter().gains, fresh(3)
     u = np.array([0.3, 0.0, 5.0])

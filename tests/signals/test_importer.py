@@ -10,8 +10,8 @@ from adapter.signals.recording import describe
 from adapter.signals.source_signals import ImportSpec
 from drivers.files.mcap import read_log
 from drivers.interface import DriverError
+from tests.helpers.robot_models import shared
 
-SHARED = Path(__file__).parents[2].parent / "shared"
 ROWS = 400
 RNG = np.random.default_rng(3)
 TIME = 2.0 + np.arange(ROWS) * 1e-3
@@ -63,12 +63,6 @@ def test_columns_by_name_and_pattern(tmp_path):
 def test_usual_names_need_no_map(tmp_path, header):
     log, _ = run(tmp_path, [write(tmp_path / "t.csv", TABLE, header=header)])
     assert_same(log)
-
-
-def test_decimal_commas(tmp_path):
-    table = write(tmp_path / "t.csv", TABLE, ";")
-    table.write_text(table.read_text().replace(".", ","))
-    assert_same(run(tmp_path, [table], COLUMNS)[0])
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
@@ -141,23 +135,6 @@ def test_lengths_that_do_not_fit(tmp_path):
         run(tmp_path, [tmp_path / "nowhere.txt"])
 
 
-def test_doubts_are_said(tmp_path):
-    spoiled = TABLE.copy()
-    spoiled[5, 6] = np.nan
-    spoiled[10, 0] -= 0.1
-    table = write(tmp_path / "t.csv", spoiled * np.array([1e3, 2000, 2000, 100, 100, 1, 1]))
-    spec = ImportSpec.from_options([str(table)], COLUMNS, "time=s,q=rad")
-    said = "\n".join(import_file(spec, tmp_path / "out.mcap").warnings)
-    for doubt in (
-        "time runs backwards 1 times, first at sample 10",
-        "samples are 1 s apart; is the time in s?",
-        "tau is not a number in 1 samples, first in sample 5",
-        "are they degrees? Say q=deg",
-        "times the slope of the positions",
-    ):
-        assert doubt in said, doubt
-
-
 def test_describe(tmp_path):
     table = TABLE.copy()
     table[100:, 0] += 0.06
@@ -175,9 +152,8 @@ def test_describe(tmp_path):
     assert not facts["truncated"]
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the folder of real logs is not beside the project")
 def test_the_real_panda_log(tmp_path):
-    folder = SHARED / "data/panda_gaz2019"
+    folder = shared("data/panda_gaz2019")
     files = {"time": "time", "q": "positions", "dq": "velocity", "tau": "torques"}
     sources = [f"{s}={folder}/exciting_traj_{name}.txt" for s, name in files.items()]
     log, report = run(tmp_path, sources, joint_names=tuple(f"panda_joint{i}" for i in range(1, 8)))
@@ -189,10 +165,9 @@ def test_the_real_panda_log(tmp_path):
     assert facts["period_ms"]["max"] == pytest.approx(8.81, abs=0.01)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the folder of real logs is not beside the project")
 def test_the_real_lwr_log(tmp_path):
     names = tuple(f"lwr_{i}_joint" for i in range(7))
-    log, report = run(tmp_path, [SHARED / "data/lwr4/measurements_1.npz"], joint_names=names)
+    log, report = run(tmp_path, [shared("data/lwr4/measurements_1.npz")], joint_names=names)
     assert len(log) == 5027
     assert ["cmd=target_positions" in said for said in report.warnings] == [True]
     assert report.rate_hz == pytest.approx(200, rel=1e-3)

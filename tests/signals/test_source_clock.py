@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adapter.signals.source_clock import source_stamps
+from adapter.screening.timing import source_stamps
 
 JOINTS = 5
 MS = 1_000_000

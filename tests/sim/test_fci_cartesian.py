@@ -16,28 +16,25 @@ from sim.fci.codec import ERRORS, Request, RobotCommand
 from sim.fci.gripper import Fingers, GripperServer
 from sim.fci.robot import Robot
 from sim.scenarios import build
+from tests.sim.test_fci_server_faults import move
 
 ZERO = np.zeros(7)
 PREFIX = "cartesian_motion_generator_"
 TICKS = 600  # of an eased motion
 
 
-def move(controller, generator):
-    return Request("Move", 1, 5, struct.pack("<II", controller, generator) + bytes(48))
-
-
 @pytest.fixture(params=["nominal", "real_drives"])
 def robot(request):
     made = Robot(build(request.param, 1), 5)
     yield made
-    made.arm.close()
+    made.arm.plant.close()
 
 
 @pytest.fixture
 def still():
     made = Robot(build("nominal", 1), 5)
     yield made
-    made.arm.close()
+    made.arm.plant.close()
 
 
 def answer(pose=None, twist=None, elbow=None, end=False):
@@ -147,7 +144,7 @@ def test_an_fr3_slows_down_towards_the_end_of_a_joint():
         if robot.motion is None:
             break
     reached = robot.arm.q[6]
-    robot.arm.close()
+    robot.arm.plant.close()
     assert robot.violations == ["joint_motion_generator_velocity_limits_violation"]
     assert reached == pytest.approx(3.0196 - 1.35**2 / 34.0, abs=1e-2)
 
@@ -181,7 +178,7 @@ def test_a_push_moves_the_hand_as_far_as_the_stiffness_says(stiffness):
     assert robot.motion is not None
     step = difference(start, robot.arm.pose)
     turn = np.cross(step[3:], [0, 0, 0.107])
-    robot.arm.close()
+    robot.arm.plant.close()
     # the push acts 0.107 m behind the hand, which turns it a little as well
     assert step[1] == pytest.approx(10.0 / stiffness, rel=0.1, abs=np.abs(turn).max())
 
@@ -199,7 +196,7 @@ def test_a_threshold_below_a_push_ends_the_motion():
         for _ in range(400):
             robot.tick(answer(start))
         assert robot.violations == ended
-        robot.arm.close()
+        robot.arm.plant.close()
 
 
 # Gripper

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from sim.fci.codec import (
     COMMAND_BYTES,
     ERRORS,
+    LIMIT_REPLY,
     NAMES,
     BadRequest,
     Request,
     RequestReader,
     StateFrame,
-    limit_reply,
     read_command,
     reply,
 )
@@ -158,7 +158,8 @@ def test_replies_have_their_published_bytes():
     move = Request("Move", 1, 2, struct.pack("<II", 2, 1) + bytes(48))
     assert move.move_modes() == (2, 1)
     assert reply(move, "motion started", 5) == bytes.fromhex("01000000 02000000 0d000000 01")
-    assert len(limit_reply(Request("GetCartesianLimit", 3, 0, bytes(4)), 5)) == 166
+    limit = Request("GetCartesianLimit", 3, 0, bytes(4))
+    assert len(reply(limit, "ok", 5, bytes(LIMIT_REPLY))) == 166
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from adapter.model.spatial import matrix_from_zxz
@@ -25,7 +24,7 @@ from sim.falls.data_set import (
 )
 from sim.falls.fall import TOP_SPEED, FallRecord, TreeTruth, atlas, babble
 from sim.truth import body_of
-from tests.helpers.arm_data import pin_tree
+from tests.helpers.arm_data import free_answers, pin_tree
 from tests.helpers.random_trees import random_tree
 from tests.helpers.robot_models import read_quietly, shared
 
@@ -37,35 +36,12 @@ def tree_of(name: str) -> TreeTruth:
 
 
 def answers(truth: TreeTruth, record: FallRecord, rows: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Base wrench, joint torques, motion (rows, n, 4, 3) of the links and largest force, by rows.
-
-    The record's accelerations are already without gravity, so Pinocchio works without it too; the
-    base's orientation then is of no account.
-    """
+    """Base wrench, joint torques, motion (rows, n, 4, 3) of links and largest force, by rows."""
     model = pin_tree(truth.parent, truth.R, truth.p, truth.theta, np.zeros(3), free=True)
-    data, numbers = model.createData(), range(1, truth.n + 2)
-    places = [model.joints[k].idx_v for k in numbers[1:]]
-    wrenches, torques, motions, forces = [], [], [], []
-    for k in rows:
-        q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
-        q[[x + 1 for x in places]] = record.q[k]
-        v[places], a[places] = record.dq[k], record.ddq[k]
-        v[:6] = *record.base_v[k], *record.base_w[k]
-        spatial = record.base_a[k] - np.cross(record.base_w[k], record.base_v[k])
-        a[:6] = *spatial, *record.base_dw[k]
-        tau = pin.rnea(model, data, q, v, a)
-        wrenches.append(tau[:6].copy())
-        torques.append(tau[places])
-        forces.append(max(np.linalg.norm(data.f[i].linear) for i in numbers[1:]))
-        pin.forwardKinematics(model, data, q, v, a)
-        motions.append([_motion(model, data, i) for i in numbers[1:]])
-    return np.array(wrenches), np.array(torques), np.array(motions), np.array(forces)
-
-
-def _motion(model: pin.Model, data: pin.Data, number: int) -> np.ndarray:
-    twist = data.v[number]
-    accel = pin.getClassicalAcceleration(model, data, number, pin.LOCAL)
-    return np.stack([twist.linear, twist.angular, accel.linear, accel.angular])
+    signals = record.q, record.dq, record.ddq
+    base = record.base_v, record.base_w, record.base_a, record.base_dw
+    tau, motion, force = free_answers(model, [x[rows] for x in signals], [x[rows] for x in base])
+    return tau[:, :6], tau[:, 6:], motion, force
 
 
 @pytest.mark.parametrize("name", ["atlas", "5", "33"])

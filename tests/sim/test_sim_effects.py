@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from sim.noise import levels_of
 from sim.plant import Plant
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model, rms
-from tests.helpers.gap_effects import effect_from, joint_torque, rnea, torque_sensor
+from tests.helpers.gap_effects import joint_torque, rnea, torque_sensor
 from tests.sim.test_plant import T_S, reference
 
 SECONDS = 1.0
@@ -250,31 +249,6 @@ def test_effects_act_together():
     wanted[:, 3] += late * 0.8 * np.tanh(record.dq[:, 3] / 0.01) + record.q[:, 3]
     wanted[:, 3] *= 0.96
     assert rms((record.read_tau - wanted)[record.steady(effects[0])]).max() < 3e-3
-
-
-def test_brakes_hold_an_arm_with_effects():
-    effects = (
-        Effect("payload", (), BALL, (0.1, None)),
-        Effect("coulomb_friction", (4,), {"Fc": 1.0}),
-    )
-    plant = Plant(arm_with(*effects), noise=levels_of("none"))
-    for _ in range(600):
-        sample = plant.read()
-    assert sample.q == pytest.approx(panda().ready, abs=1e-5)
-
-
-def test_truth_file_holds_the_canonical_entries():
-    effect = Effect("payload", (), {**BALL, "inertia": INERTIA}, (2.0, None))
-    told = json.loads(json.dumps(arm_with(effect).as_dict()))["effects"]
-    assert told == [
-        {
-            "effect": "payload",
-            "joints": [],
-            "interval_s": [2.0, None],
-            "parameters": {**BALL, "inertia": INERTIA},
-        }
-    ]
-    assert effect_from({**told[0], "std": {}, "units": {}}) == effect
 
 
 @pytest.mark.parametrize(

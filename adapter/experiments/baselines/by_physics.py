@@ -79,7 +79,10 @@ class MassNetwork(nn.Module):
         super().__init__()
         self.size = len(scale)
         self.register_buffer("scale", scale)
-        self.register_buffer("place", self._places())
+        # flat places of the factor's diagonal, then of what is below it
+        diagonal = torch.arange(self.size) * (self.size + 1)
+        rows, columns = torch.tril_indices(self.size, self.size, -1)
+        self.register_buffer("place", torch.cat([diagonal, rows * self.size + columns]))
         sizes = (2 * (self.size - BASE_ROWS), *hidden, len(self.place))
         generator = torch.Generator().manual_seed(seed)
         layers = [nn.Linear(ins, outs) for ins, outs in pairwise(sizes)]
@@ -88,12 +91,6 @@ class MassNetwork(nn.Module):
             nn.init.xavier_normal_(layer.weight, gain, generator=generator)
             nn.init.zeros_(layer.bias)
         self.inner, self.last = nn.ModuleList(layers[:-1]), layers[-1]
-
-    def _places(self) -> Tensor:
-        """Flat places of the factor's diagonal, then of what is below it."""
-        diagonal = torch.arange(self.size) * (self.size + 1)
-        rows, columns = torch.tril_indices(self.size, self.size, -1)
-        return torch.cat([diagonal, rows * self.size + columns])
 
     def forward(self, q: Tensor) -> Tensor:
         """M (m, 6 + n, 6 + n)."""

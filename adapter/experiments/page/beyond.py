@@ -63,7 +63,10 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
             [_share(x) if x > 0.0 else "none was reported" for x in wrong],
         ),
         ("longest recording", [with_unit(x["motion_s"], "s", 3) for x in trials]),
-        ("measured on every link", [_channels(x["measured"]) for x in trials]),
+        (
+            "measured on every link",
+            [listed([KINDS[kind][0] for kind in x["measured"].split(", ")]) for x in trials],
+        ),
     ]
     return Table(["", *(name for name, _ in robots)], [[what, *cells] for what, cells in rows])
 
@@ -71,11 +74,6 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
 def _share(confidence: float) -> str:
     """Never rounded up to certainty."""
     return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
-
-
-def _channels(measured: str) -> str:
-    """Channels by name: "w, a" is angular velocity and acceleration."""
-    return listed([KINDS[x][0] for x in measured.split(", ")])
 
 
 def online_table(online: Mapping[str, Any]) -> Table | None:

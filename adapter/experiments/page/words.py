@@ -71,15 +71,14 @@ def _sentence(piece: str) -> str:
     said = re.sub(r"\b\d{1,3}(?:,\d{3})+\b", lambda x: grouped(int(x[0].replace(",", ""))), said)
     said = re.sub(r"\b\d{5,}\b", lambda x: grouped(int(x[0])), said)
     said = re.sub(r"(\d)%", rf"\1{NARROW}%", said)
-    said = re.sub(r"\b\d+(?:\.(\d+))?e[+-]\d+\b", _plain, said)
+    said = re.sub(  # a number with an exponent, with as many digits
+        r"\b\d+(?:\.(\d+))?e[+-]\d+\b",
+        lambda x: scientific(float(x[0]), 1 + len(x[1] or "")),
+        said,
+    )
     said = re.sub(r"(?<![\w.])-(?=\d)", "−", said)
     first = said[:1]
     return f"{first.upper() if first.isascii() else first}{said[1:]}."  # θ stays small
-
-
-def _plain(power: re.Match[str]) -> str:
-    """A number with an exponent, as `scientific` writes it, with as many digits."""
-    return scientific(float(power[0]), 1 + len(power[1] or ""))
 
 
 def ours_text(item: Stated) -> str:

@@ -14,6 +14,8 @@ from adapter.model.spatial import Array
 
 LENGTH = 0.1  # m, in units of which the entries of a link's pseudo-inertia (kg) are of like size
 SOLVED = ("Solved", "AlmostSolved")
+# Where the entries of a body's matrix are those of a possible body; where a number is not below 0.
+POSSIBLE, NONNEGATIVE = clarabel.PSDTriangleConeT(4), clarabel.NonnegativeConeT(1)
 
 _UPPER = [(row, column) for column in range(4) for row in range(column + 1)]
 
@@ -31,16 +33,6 @@ def matrices(entry: Array) -> Array:
     for k, (i, j) in enumerate(_UPPER):
         out[..., i, j] = out[..., j, i] = entry[..., k] / (1.0 if i == j else np.sqrt(2.0))
     return out
-
-
-def cones(bodies: int) -> list[object]:
-    """Where the entries of so many bodies' matrices are those of possible bodies."""
-    return [clarabel.PSDTriangleConeT(4)] * bodies
-
-
-def nonnegative(count: int) -> object:
-    """Where so many numbers are not below zero."""
-    return clarabel.NonnegativeConeT(count)
 
 
 def solve_conic(

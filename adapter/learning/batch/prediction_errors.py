@@ -8,12 +8,7 @@ import numpy as np
 
 from adapter.errors import ModelError
 from adapter.learning.schema_kernels import CHANNELS
-from adapter.learning.tree_data import (
-    TreeData,
-    check_dynamics,
-    check_finite,
-    check_motion,
-)
+from adapter.learning.tree_data import TreeData, check_dynamics, check_finite, check_motion
 from adapter.model.spatial import Array
 from adapter.physics.kernels import frames_of, link_motions, torques
 

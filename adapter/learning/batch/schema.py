@@ -10,16 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapter.learning import frame_fit
 from adapter.learning.batch.moments import SchemaMoments, schema_moments
-from adapter.learning.frame_fit import (
-    RELATIVE_CURVATURE,
-    Frame,
-    best_frame,
-    channel_costs,
-    curvature_in_parent,
-    descend,
-    nearest,
-)
 from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array, zxz_from_matrix
 from adapter.physics.freedom import Freedom
@@ -78,25 +70,25 @@ class _Joint:
     def __init__(self, moments: SchemaMoments, j: int, noise: Array | None) -> None:
         self.count, self.raw = moments.count, moments.sums[j]
         self.used = np.array([True, moments.with_speed, True, True])
-        zero = Frame(np.eye(3), np.zeros(3))
+        zero = frame_fit.Frame(np.eye(3), np.zeros(3))
         given = None if noise is None else noise**2
         self.sums = self.raw if given is None else moments.without_noise(j, given)
         self.power = moments.power()[j]
         weights = self._weights(self.power / (3.0 * self.count))
-        self.frame, _ = best_frame(self.sums, weights, zero)
+        self.frame, _ = frame_fit.best_frame(self.sums, weights, zero)
         for _ in range(2):  # of weighting by what the fit leaves
             weights = self._weights(self._left_over() if given is None else 2.0 * given)
-            self.frame, _ = descend(self.sums, weights, self.frame)
+            self.frame, _ = frame_fit.descend(self.sums, weights, self.frame)
         clean = self.sums
         if given is None:
             clean = moments.without_noise(j, 0.5 * self._left_over())
         self._judge(clean, weights)
         freedom = Freedom.of(np.eye(6)[None] - self.shown, self.frame.p[None])
-        self.frame = nearest(self.sums, weights, self.frame, zero, freedom)
+        self.frame = frame_fit.nearest(self.sums, weights, self.frame, zero, freedom)
 
     def _left_over(self) -> Array:
         """Mean square (4,) by component of what the fit leaves, with the data's own noise in."""
-        return channel_costs(self.raw, self.frame) / (3.0 * self.count)
+        return frame_fit.channel_costs(self.raw, self.frame) / (3.0 * self.count)
 
     def _weights(self, variance: Array) -> Array:
         """1 / variance by channel; a channel without signal or measurement weighs nothing."""
@@ -108,10 +100,10 @@ class _Joint:
 
     def _judge(self, clean: Array, weights: Array) -> None:
         """Directions that count as shown, and the spread inside them, in the parent's axes."""
-        values, vectors = curvature_in_parent(clean, weights, self.frame)
+        values, vectors = frame_fit.curvature_in_parent(clean, weights, self.frame)
         # Noise alone makes curvature of the size of the square root of the count (schema learner).
         least = max(0.05**-2, 10.0 * np.sqrt(self.count))  # 0.05 rad or m: more is not shown
-        shown = values > max(least, RELATIVE_CURVATURE * float(values[-1]))
+        shown = values > max(least, frame_fit.RELATIVE_CURVATURE * float(values[-1]))
         kept = vectors[:, shown]
         self.shown = kept @ kept.T
         self.std = np.sqrt(np.einsum("ak,k->a", kept**2, 1.0 / values[shown]))

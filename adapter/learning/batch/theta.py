@@ -25,18 +25,8 @@ from adapter.model.tree import BASE, Tree
 ROUNDS = 5  # of weighting by what is left, at most
 
 _SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
-_LIMBS = {
-    "leg": "leg",
-    "foot": "leg",
-    "knee": "leg",
-    "hip": "leg",
-    "ankle": "leg",
-    "arm": "arm",
-    "hand": "arm",
-    "wrist": "arm",
-    "elbow": "arm",
-    "shoulder": "arm",
-}
+_LIMBS = dict.fromkeys(("leg", "foot", "knee", "hip", "ankle"), "leg")
+_LIMBS |= dict.fromkeys(("arm", "hand", "wrist", "elbow", "shoulder"), "arm")
 
 
 def branches(tree: Tree) -> dict[str, tuple[int, ...]]:

@@ -15,13 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.learning.batch.conic import (
-    cones,
-    entries,
-    matrices,
-    nonnegative,
-    solve_conic,
-)
+from adapter.learning.batch.conic import NONNEGATIVE, POSSIBLE, entries, matrices, solve_conic
 from adapter.model.inertia import (
     PARAMETERS,
     is_consistent,
@@ -153,7 +147,7 @@ class Measure:
         self._root[:, :3, :3] = vectors * np.sqrt(np.maximum(values, mass * 0.03**2))[:, None, :]
         self._root[:, :3, 3], self._root[:, 3, 3:] = np.sqrt(mass) * centre, np.sqrt(mass)
         self._inverse = np.linalg.inv(self._root)
-        self.told, self.cones = self.of(told), cones(len(told))
+        self.told, self.cones = self.of(told), [POSSIBLE] * len(told)
         values, vectors = np.linalg.eigh(matrices(self.told.reshape(-1, 10)))
         size = np.sqrt(np.clip(values, LEAST_SIZE, 1.0))[:, None, :]
         back = np.swapaxes(vectors, -1, -2)
@@ -192,7 +186,7 @@ def _most_room(measure: Measure, start: Array, free: Array) -> float:
         np.append(np.zeros(count), -1.0),
         np.vstack([np.column_stack([-free, measure.own]), np.append(np.zeros(count), 1.0)]),
         np.append(start, KEPT),
-        [*measure.cones, nonnegative(1)],
+        [*measure.cones, NONNEGATIVE],
     )
     if not np.isfinite(x).all():
         return 0.0

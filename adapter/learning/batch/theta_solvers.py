@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from adapter.errors import ModelError
-from adapter.learning.batch.conic import LENGTH, cones, entries, nonnegative, solve_conic
+from adapter.learning.batch.conic import LENGTH, NONNEGATIVE, POSSIBLE, entries, solve_conic
 from adapter.model.inertia import min_eigenvalue, pseudo_inertia
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import RANK_TOLERANCE
@@ -114,7 +114,7 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
     goal = np.append(1e-6 * (free.T @ one), -1.0)  # what is unseen stays light
     in_cone = np.column_stack([-free, one])
     in_room = np.append(np.zeros(count), 1.0)
-    in_cones = [*cones(bodies), nonnegative(1)]
+    in_cones = [*[POSSIBLE] * bodies, NONNEGATIVE]
     x, steps, _ = solve_conic(
         np.zeros((count + 1, count + 1)),
         goal,
@@ -136,14 +136,9 @@ def _closest(r: Array, b: Array) -> tuple[Array, int, bool]:
     power = float(b @ b) or 1.0
     quadratic, goal = table.T @ table / power, -(table.T @ b) / power
     hold = HELD * float(np.trace(quadratic)) / len(quadratic)
-    one = np.tile(_ONE, bodies)
-    x, steps, solved = solve_conic(
-        quadratic + hold * np.eye(len(quadratic)),
-        goal - hold * one,
-        -np.eye(len(quadratic)),
-        -EDGE * one,
-        cones(bodies),
-    )
+    eye, one = np.eye(len(quadratic)), np.tile(_ONE, bodies)
+    edges = -eye, -EDGE * one, [POSSIBLE] * bodies
+    x, steps, solved = solve_conic(quadratic + hold * eye, goal - hold * one, *edges)
     if not np.isfinite(x).all():
         raise ModelError("no possible bodies were found near what the data say; are they sound?")
     theta = x.reshape(bodies, 10) @ _TO_THETA.T

@@ -27,7 +27,6 @@ from adapter.model.urdf import read_urdf
 from drivers.errors import choices
 
 SAME_TURN, SAME_PLACE_M = 0.2, 0.05  # a learned λ may differ so much from the documented one
-SAME_LIMIT = 0.02  # rad
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,7 @@ class SpeedByPosition:
     def between(self, low: Array, high: Array) -> Array:
         """Speed (n,) rad/s that is allowed in both directions everywhere from low to high (n,)."""
         room = np.maximum(np.minimum(self.upper - high, low - self.lower), 0.0)
-        speed: Array = np.maximum(np.sqrt(2.0 * self.deceleration * room) - self.offset, 0.0)
-        return speed
+        return np.maximum(np.sqrt(2.0 * self.deceleration * room) - self.offset, 0.0)
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def facts_of(model: SelfModel) -> RobotFacts | None:
     for robot in same:
         own = robot.model.limits
         apart = np.abs([own.lower - its.lower, own.upper - its.upper])
-        limited += [robot] if (apart < SAME_LIMIT).all() else []
+        limited += [robot] if (apart < 0.02).all() else []
     named = [robot for robot in same if model.name.lower().startswith(robot.names)]
     return next(iter(limited or named), None)
 

@@ -24,8 +24,6 @@ from adapter.runs.fleet.course import Drift, Series, StandsOut, courses
 from adapter.runs.fleet.moments import LogMoments, effects_for, learner_of
 from adapter.runs.outcome import Outcome, collect, learned_model
 
-FITS = 6  # of weights and priors to what was found with those before
-LOAD_ROUNDS = 4  # of loads to weights
 ROUNDS = 5  # of who agrees to the model that these make
 LEAST_LOAD_KG, LOAD_STD = 0.05, 4.0  # less than this, or so many standard deviations, is no load
 TIMES_WORSE = 1.5  # than its own best fit and than other logs: one that disagrees
@@ -135,7 +133,7 @@ def _learned(
     theta = learner.theta
     _pool(theta, used, {})
     loads: dict[str, tuple[Array, float]] = {}
-    for _ in range(LOAD_ROUNDS if len(used) >= FEWEST_TO_COMPARE else 0):
+    for _ in range(4 if len(used) >= FEWEST_TO_COMPARE else 0):  # of loads to weights
         before, loads = loads, _loads(theta, used)
         if not before and not loads:
             break
@@ -150,7 +148,7 @@ def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array])
     count = sum(log.count for log in found)
     counts = np.full(theta.tree.n, count)
     theta.replace_moments(Moments(A, *theta.moments[1:4], counts), count)
-    for _ in range(FITS):
+    for _ in range(6):  # weights and priors follow what was found with those before
         theta.th[:] = theta.least_squares()
         theta.adapt_prior()
     theta.th[:] = _solution(theta)
@@ -198,10 +196,8 @@ def _loads(theta: Theta, found: Sequence[LogMoments]) -> dict[str, tuple[Array, 
     beyond = np.abs(masses - usual.body[0]) > np.maximum(LEAST_LOAD_KG, LOAD_STD * std)
     loaded = [k for k, x in enumerate(beyond) if x]
     again = _solved(theta, found, loaded)
-    return {
-        found[k].content: (x.body, _mass_std(theta, x, None))
-        for k, x in zip(loaded, again, strict=True)
-    }
+    pairs = zip(loaded, again, strict=True)
+    return {found[k].content: (x.body, _mass_std(theta, x, None)) for k, x in pairs}
 
 
 class Body(NamedTuple):
@@ -292,14 +288,11 @@ def _of_logs(
         worth = 0.5 * float(np.linalg.slogdet(more)[1] - before) / len(known)
         effects, std = _own_effects(theta, information, side, rmse)
         carried = None if load is None else Load(float(load[0][0]), load[1])
-        told.append(
-            OfLog(log, log.content in among, carried, effects, std, rmse, own_rmse, (), worth)
-        )
+        own = carried, effects, std, rmse, own_rmse
+        told.append(OfLog(log, log.content in among, *own, (), worth))
     usual = np.median([x.rmse for x in told if x.used], axis=0)
-    out = [
-        replace(x, disagrees=_worse(x, usual, len(told))) if len(told) >= FEWEST_TO_COMPARE else x
-        for x in told
-    ]
+    few = len(told) < FEWEST_TO_COMPARE
+    out = [x if few else replace(x, disagrees=_worse(x, usual, len(told))) for x in told]
     return tuple(sorted(out, key=lambda x: (x.moments.begin_s, x.moments.path)))
 
 
@@ -333,11 +326,8 @@ def _series(logs: Sequence[OfLog], effects: Sequence[str]) -> list[Series]:
     """Effects joint by joint over an arm's recordings."""
     values, std = (np.array([getattr(x, key) for x in logs]) for key in ("effects", "effects_std"))
     values[[not x.used for x in logs]] = np.nan
-    return [
-        Series(name, j + 1, values[:, k, j], std[:, k, j])
-        for k, name in enumerate(effects)
-        for j in range(values.shape[2])
-    ]
+    places = [(k, j) for k in range(len(effects)) for j in range(values.shape[2])]
+    return [Series(effects[k], j + 1, values[:, k, j], std[:, k, j]) for k, j in places]
 
 
 def _columns(logs: Sequence[OfLog], told: Mapping[str, Mapping[str, float]]) -> dict[str, Array]:

@@ -26,8 +26,6 @@ from adapter.model.spatial import Array
 FEWEST = 5  # numbers that a line, or what stands out beside others, takes
 CHANCE = 0.01  # of one false alarm among all that is asked of an arm
 TOLD_APART = 0.01  # that one column matters beside another one, by chance
-COLLINEAR = 1e-8  # share of a column that others leave
-MOST_OUT = 0.25  # share of the recordings that may stand out
 FARTHEST = 3.0  # standard deviations that a scatter counts for away from the usual one
 MOST_FREEDOM = 16.0  # what all say of one, as so many numbers of its own; more, and a tail counts
 TINY = 1e-300
@@ -100,10 +98,10 @@ def courses(
     """
     use = [np.isfinite(x.values) & (x.std > 0.0) for x in series]
     drifts = _drifts(series, columns, use)
-    follows = [
-        [columns[x.follows] for x in drifts if (x.effect, x.joint) == (one.effect, one.joint)]
-        for one in series
-    ]
+    by: dict[tuple[str, int], list[Array]] = {}
+    for x in drifts:
+        by.setdefault((x.effect, x.joint), []).append(columns[x.follows])
+    follows = [by.get((one.effect, one.joint), []) for one in series]
     out: list[StandsOut] = []
     while farthest := list(_standing_out(series, follows, use)):
         for k, found in farthest:  # another one may have hidden behind it
@@ -130,11 +128,10 @@ def _drifts(series: Sequence[Series], columns: Mapping[str, Array], use: Used) -
                 mean = float(np.average(one.values[ours], weights=one.std[ours] ** -2.0))
                 drift = Drift(one.effect, one.joint, name, slope, std, span, mean, chance)
                 own.append(drift)
-    apart = (
-        _told_apart(one, sorted(own, key=lambda x: x.chance), columns, ours)
-        for one, own, ours in zip(series, found, use, strict=True)
-    )
-    return sorted((x for several in apart for x in several), key=lambda x: (x.chance, -x.span))
+    apart: list[Drift] = []
+    for one, own, ours in zip(series, found, use, strict=True):
+        apart += _told_apart(one, sorted(own, key=lambda x: x.chance), columns, ours)
+    return sorted(apart, key=lambda x: (x.chance, -x.span))
 
 
 def _told_apart(
@@ -173,7 +170,7 @@ def _standing_out(
     for k, (one, fit) in enumerate(zip(series, fits, strict=True)):
         if fit is None or fit.freedom < FEWEST - 2:
             continue
-        if len(fit.left) <= (1.0 - MOST_OUT) * len(one.values):
+        if len(fit.left) <= 0.75 * len(one.values):  # no more may stand out
             continue
         rest = np.maximum(1.0 - fit.leverage, TINY)
         away = fit.left / rest
@@ -225,7 +222,7 @@ def _fit(one: Series, follows: Sequence[Array], use: NDArray[np.bool_]) -> Fit |
     scaled = [(x[use] - m) / s for x, m, s in zip(follows, middle, size, strict=True)]
     rows = np.column_stack([np.ones(int(use.sum())), *scaled]) / one.std[use, None]
     sides, values, turn = np.linalg.svd(rows, full_matrices=False)
-    if values[-1] <= COLLINEAR * values[0]:
+    if values[-1] <= 1e-8 * values[0]:  # of a column others leave nothing
         return None
     target = one.values[use] / one.std[use]
     back = np.diag(np.r_[1.0, 1.0 / size])  # to the columns' own units

@@ -21,7 +21,6 @@ Result = TypeVar("Result")
 Done = Iterator[tuple[Task, Result | Broken]]
 TRIES = 2  # of a task whose process died, in a process of its own
 AT_HAND = 2  # tasks of each process: one that it does, and the next
-ON_CLUSTER = 1000  # tasks that the scheduler knows of at once
 ANSWER_S, WORKER_S = 10.0, 60.0  # until nobody is there; until no worker is
 CONNECTIONS = 3  # with a scheduler that is lost again and again
 
@@ -156,7 +155,7 @@ def _sent(
         return future
 
     asked: dict[Any, Task] = {}
-    waiting = distributed.as_completed([send(task) for task in islice(left, ON_CLUSTER)])
+    waiting = distributed.as_completed([send(task) for task in islice(left, 1000)])  # at once
     for future in waiting:
         task = asked.pop(future)
         if future.status == "finished":

@@ -143,10 +143,8 @@ def read_manifest(path: Path) -> Manifest:
         columns = list(reader.fieldnames or ())
         key = next((x for x in columns if x.strip().lower() in LOG_COLUMNS), None)
         if key is None:
-            raise SettingsError(
-                f"{path}: needs a column named one of {', '.join(LOG_COLUMNS)}; has: "
-                f"{', '.join(columns) or 'nothing'}"
-            )
+            has = f"{', '.join(LOG_COLUMNS)}; has: {', '.join(columns) or 'nothing'}"
+            raise SettingsError(f"{path}: needs a column named one of {has}")
         arms: dict[str, str] = {}
         told: dict[str, dict[str, float]] = {}
         for number, row in enumerate(reader, start=2):
@@ -179,9 +177,8 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
         SettingsError: the model's base floats.
     """
     if documented.tree.floating:
-        raise SettingsError(
-            f"a fleet is of arms whose base stands; that of {documented.name} floats"
-        )
+        said = f"that of {documented.name} floats"
+        raise SettingsError(f"a fleet is of arms whose base stands; {said}")
     model = model_file.dumps(documented)
     store = _store(documented, settings)
     tasks = [Task(path, model, settings.topic, settings.told) for path in dict.fromkeys(given)]

@@ -194,20 +194,16 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
 
 def arm_named(metadata: dict[str, Any]) -> str | None:
     """Name or serial number of the arm that a recording tells, if it does."""
-    for entry in (metadata, *(x for x in metadata.values() if isinstance(x, dict))):
-        for key in ARM_KEYS:
-            if isinstance(entry.get(key), str | int) and str(entry[key]).strip():
-                return str(entry[key]).strip()
-    return None
+    entries = (metadata, *(x for x in metadata.values() if isinstance(x, dict)))
+    told = (entry.get(key) for entry in entries for key in ARM_KEYS)
+    return next(filter(None, (str(x).strip() for x in told if isinstance(x, str | int))), None)
 
 
 def _learning(model: SelfModel) -> LearnerSettings:
     return LearnerSettings(effects=effects_for(model))
 
 
-@lru_cache(maxsize=4)
-def _model(text: str) -> SelfModel:
-    return model_file.loads(text)
+_model = lru_cache(maxsize=4)(model_file.loads)
 
 
 @contextmanager

@@ -44,8 +44,6 @@ _PACKED: dict[bytes, Callable[[Any], Any]] = {
     b"\x1f\x8b": lambda file: gzip.GzipFile(fileobj=file),
 }
 _HEAD = struct.Struct("<HIQQ")  # of a message as MCAP has it: channel, sequence, two times
-_OWN_SCHEMAS = 2**16  # beyond the numbers that a file can give its schemas
-_TOGETHER = 4096  # messages of one region
 _STEP = 2**20
 _REGION_BYTES = 2**24  # beyond them a region ends
 _COMPUTED = """
@@ -411,7 +409,7 @@ class McapOfAnyRos(McapScan):
                 return
             self._from_ros1[number] = partial(convert, kind)
         told = JOINT_STATE if kind == FRANKA_STATE else kind
-        own = _OWN_SCHEMAS + number
+        own = 2**16 + number  # beyond the numbers that a file can give its schemas
         self.schemas[own] = Schema(own, b"", "ros2msg", told)
         self.channels[number] = Channel(number, channel.topic, "cdr", channel.metadata, own)
 
@@ -437,7 +435,7 @@ def _regions(messages: Iterator[tuple[bytes, bytes]]) -> Iterator[Region]:
             starts.append(len(data))
             data += content
             stops.append(len(data))
-            if len(starts) == _TOGETHER or len(data) > _REGION_BYTES:
+            if len(starts) == 4096 or len(data) > _REGION_BYTES:  # messages of one region
                 more = True
                 break
         if starts:

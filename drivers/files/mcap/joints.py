@@ -22,9 +22,7 @@ from drivers.interface import Array, DriverError
 
 _IN_MEMORY = 2**20  # bytes of a column that stay in memory
 _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
-_DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspected
 _NEED = "learning needs positions and measured joint torques (effort)"
-_NEED_POSITION = "discovery needs the positions of the joints"
 Q, DQ, TAU = range(3)  # runs of doubles in a message
 _CLOCKS = attrgetter("stamp_ns"), attrgetter("log_ns")  # of a block
 _PLACE = attrgetter("index")
@@ -212,7 +210,7 @@ class Told:
                 f"({others or 'a part of these, or twice'}); left out"
             )
         own = sets[chosen]
-        need = _NEED if TAU in self._needed else _NEED_POSITION
+        need = _NEED if TAU in self._needed else "discovery needs the positions of the joints"
         what_of = {Q: "position", TAU: "effort"}
         for run in self._needed:
             if run not in own.present:
@@ -353,5 +351,5 @@ def _are_degrees(beyond: NDArray[np.int64], count: int) -> bool:
     """The same by how many of `count` samples each joint (n,) spends beyond."""
     if count == 0:
         return False
-    suspects = beyond / count > _DEGREE_SHARE
+    suspects = beyond / count > 0.05  # of the samples a joint must spend beyond it to be suspected
     return bool(suspects.sum() >= max(1, len(suspects) // 3))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import choices
 from drivers.files.bounded import parse_json
-from drivers.files.estimates import estimate_values, values_of_json
+from drivers.files.estimates import estimate_values
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.joints import (
     TAU,
@@ -232,14 +232,11 @@ def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
 def read_estimates(path: str | Path) -> Iterator[dict[str, Any]]:
     """The estimates in a recording, in the order of the file, as `estimate_values` tells them.
 
-    Those of recordings before version 0.2 are JSON and tell less: no names, no standard
-    deviations. Raises DriverError.
+    Raises DriverError.
     """
     for message in read_messages(path, ESTIMATES):
         if message.schema == ESTIMATE:
             yield estimate_values(message.fields)
-        else:
-            yield values_of_json(message.fields)
 
 
 def read_messages(path: str | Path, topic: str) -> Iterator[Message]:

@@ -9,14 +9,12 @@ sound it helps past damage. Source: MCAP specification, "Records".
 from __future__ import annotations
 
 import bisect
-import contextlib
 import importlib
 import mmap
 import struct
 import zlib
 from array import array
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -106,6 +104,8 @@ def decompress(chunk: Chunk, cut: bool = False) -> memoryview:
         raise DamagedChunk(f"{name} cannot read it ({error})") from error
     if not cut and len(content) != size:
         raise DamagedChunk(f"it does not make the {size} bytes that it claims")
+    if not cut and chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+        raise DamagedChunk("its checksum is wrong")
     return content
 
 
@@ -277,20 +277,10 @@ class McapScan(Scan):
         self.lost_bytes = 0
         self._rescued = self._made = self._given_back = 0
         self._chunks: list[int] = []
-        self._second: ThreadPoolExecutor | None = None
-        self._ahead: dict[int, Future[memoryview]] = {}
         self._read_index()
 
     def regions(self) -> Iterator[Region]:
         """All complete messages, in the order of the file; damaged chunks are passed over."""
-        with ThreadPoolExecutor(1) as self._second:
-            try:
-                yield from self._in_order()
-            finally:  # also where somebody stops reading
-                self._second = None
-                self._ahead.clear()
-
-    def _in_order(self) -> Iterator[Region]:
         at = len(MAGIC)
         while True:
             self._give_back(at)
@@ -385,7 +375,7 @@ class McapScan(Scan):
         try:
             chunk = self._chunk_at(at)
             self._spend(chunk.uncompressed_size)
-            content = decompress(chunk, cut=True) if cut else self._content(at, chunk)
+            content = decompress(chunk, cut)
             found = walk(content, 0, _IN_CHUNK)
             if not cut and found.end != len(content):
                 raise DamagedChunk(f"its record at byte {found.end} is broken")
@@ -396,23 +386,6 @@ class McapScan(Scan):
             return
         self._rescued = len(found.start) if cut else 0
         yield from self._use(found, content)
-
-    def _content(self, at: int, chunk: Chunk) -> memoryview:
-        """Records of the chunk there; a second thread makes those of the next one meanwhile."""
-        made, after = self._ahead.pop(at, None), self._next_chunk(at)
-        self._ahead.clear()
-        if self._second is not None and after < self.size:
-            with contextlib.suppress(struct.error, UnicodeDecodeError):
-                coming = self._chunk_at(after)
-                if coming.uncompressed_size <= CHUNK_LIMIT:
-                    self._ahead[after] = self._second.submit(self._checked, coming)
-        return self._checked(chunk) if made is None else made.result()
-
-    def _checked(self, chunk: Chunk) -> memoryview:
-        content = decompress(chunk)
-        if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
-            raise DamagedChunk("its checksum is wrong")
-        return content
 
     def _spend(self, size: int) -> None:
         """Count what chunks make. Raises DamagedChunk where no recording makes so much."""

@@ -1,8 +1,4 @@
-"""Mends a cut or damaged recording: all complete messages into a file with a proper end.
-
-Estimates in JSON, as recordings before version 0.2 have them, become ROS 2 messages on the way, so
-that other programs read the file.
-"""
+"""Mends a cut or damaged recording: all complete messages into a file with a proper end."""
 
 from __future__ import annotations
 
@@ -17,12 +13,8 @@ from typing import IO
 from mcap.records import Channel
 from mcap.writer import Writer
 
-from drivers.files.bounded import parse_json
-from drivers.files.estimates import FLAGS, EstimateNames, estimate_fields, values_of_json
 from drivers.files.mcap.records import McapScan
-from drivers.files.mcap.writer import ESTIMATES, LIBRARY, METADATA
-from drivers.files.messages import encode
-from drivers.files.ros_types import ESTIMATE, schemas
+from drivers.files.mcap.writer import LIBRARY
 from drivers.interface import DriverError
 
 
@@ -107,8 +99,6 @@ def _copy(scan: McapScan, file: IO[bytes]) -> Counter[str]:
             if number not in numbers:
                 numbers[number] = _register(writer, scan, channel, written)
             payload = region.data[start:stop].tobytes()
-            if _is_old(channel):
-                payload = _told_anew(scan, payload)
             writer.add_message(numbers[number], times[0], payload, times[1], sequence)
             counts[channel.topic] += 1
     if orphans:
@@ -121,40 +111,7 @@ def _copy(scan: McapScan, file: IO[bytes]) -> Counter[str]:
     return counts
 
 
-def _told_anew(scan: McapScan, payload: bytes) -> bytes:
-    """An estimate in JSON as a ROS 2 message; what JSON did not tell is not-a-number.
-
-    Raises DriverError where it is none.
-    """
-    known = {
-        key: parse_json(value)
-        for record in scan.metadata
-        if record.name == METADATA
-        for key, value in record.metadata.items()
-        if key in ("joint_names", "config")
-    }
-    try:
-        values = {**dict.fromkeys(FLAGS, 0), "lambda_source": "", **parse_json(payload)}
-        values = values_of_json(values)
-        effects = known["config"]["pipeline"]["learner"]["effects"]
-        bodies = tuple(f"body{k + 1}" for k in range(len(values["theta"])))
-        names = EstimateNames(tuple(known["joint_names"]), bodies, tuple(effects))
-        fields = estimate_fields(int(values["stamp_ns"]), names, values)
-        return encode(ESTIMATE, {**fields, **{key: values[key] for key in FLAGS}})
-    except (ValueError, KeyError, TypeError) as error:
-        said = f"an estimate in JSON cannot be told anew: {error}"
-        raise DriverError(f"{scan.path}: {said}") from error
-
-
-def _is_old(channel: Channel) -> bool:
-    """Whether a channel holds estimates in JSON."""
-    return bool(channel.topic == ESTIMATES and channel.message_encoding == "json")
-
-
 def _register(writer: Writer, scan: McapScan, channel: Channel, written: dict[int, int]) -> int:
-    if _is_old(channel):
-        number = writer.register_schema(ESTIMATE, "ros2msg", schemas()[ESTIMATE].encode())
-        return int(writer.register_channel(channel.topic, "cdr", number))
     schema, number = scan.schemas.get(channel.schema_id), 0
     if schema is not None:
         if schema.id not in written:

@@ -35,7 +35,6 @@ from drivers.interface import Array, DriverError, JointSample, LinkMotion
 
 JOINT_STATES = "/joint_states"
 JOINT_COMMANDS = "/joint_commands"
-JOINT_TRAJECTORY_TOPIC = "/joint_trajectory"
 EXTERNAL_TORQUES = "/external_torques"
 LINK_TWISTS = "/link_twists/"
 LINK_ACCELS = "/link_accels/"
@@ -149,7 +148,7 @@ class McapWriter:
             point = zip(("positions", "velocities", "accelerations"), rows, strict=True)
             points.append({**dict(point), "effort": (), "time_from_start": after})
         fields = {"header": header(0), "joint_names": self.joint_names, "points": points}
-        self.write_message(Message(JOINT_TRAJECTORY_TOPIC, JOINT_TRAJECTORY, 0, fields))
+        self.write_message(Message("/joint_trajectory", JOINT_TRAJECTORY, 0, fields))
 
     def write_links(self, stamp_ns: int, links: LinkMotion) -> None:
         """Record the measured motion of the links, in the order of `link_names`.
