@@ -41,7 +41,7 @@ RUBS, RUBS_STD = 0.4, 0.3  # of plastics and metals on tables, handbooks of trib
 FAR_M, REACH_M = 0.05, 0.05  # what touches is so far beyond the link's centre, and around there
 TIP_M = 0.01  # around a documented tip: a finger is twice as wide
 # starts: the point; share of time that it touches; one standard deviation of its height from there
-BEYOND_M, LOWEST, HEIGHT_M = (0.0, 0.08), (0.02, 0.2), 0.1
+BEYOND_M, LOWEST, HEIGHT_M = (0.0, 0.05, 0.1), (0.02, 0.2), 0.1
 STIFF, YIELDS = 1e3, 5.0  # N/m, table and arm together; a factor of its root, one std deviation
 ROUGH, FINE = 6, 30  # steps of a fit from each start, and of the best
 # what the ground explains beside the servos, on unseen blocks, of a joint that it holds: where a
