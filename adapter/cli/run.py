@@ -13,7 +13,7 @@ from functools import partial
 from glob import escape
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from adapter import optional
 from adapter.cli.agreement import agree, need_somebody, reading
@@ -62,12 +62,20 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import joint_count, maybe_real, open_driver, split_address
 
-if TYPE_CHECKING:
-    from adapter.cli.simulated import Simulation
-
 DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
 AS_TOLD = ("set_aside", "skipped", "restarts", "recorded", "unrecorded", "tracking")  # by the loop
+
+
+class SimulationLike(Protocol):
+    """A simulated arm (`adapter.cli.simulated.Simulation`)."""
+
+    scenario: Any
+    asked_for: bool
+
+    def driver(self, rest: str) -> Driver:
+        """What opens it."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +93,7 @@ class RunPlan:
 
     robot: SelfModel
     config: Config
-    world: Simulation | None
+    world: SimulationLike | None
     maybe_real: bool
     feedforward: str
 

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, wraps
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +28,6 @@ from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import NO_PLACE, Additions
 from drivers.errors import choices
-
-if TYPE_CHECKING:  # brings numba: the catalogue is read by who needs none
-    from adapter.physics.rigid_arm import RigidArm as ArmDynamics
-else:
-    ArmDynamics = Any
 
 Flags = NDArray[np.bool_]
 Values = Mapping[str, Any]
@@ -96,6 +91,30 @@ class Parameter:
     def nearest(self, value: float) -> float:
         """The value, or the bound that it lies beyond."""
         return min(max(value, self.lower), self.upper)
+
+
+class ArmDynamics(Protocol):
+    """The rigid body that an effect acts on; see `physics.rigid_arm.RigidArm`."""
+
+    @property
+    def n(self) -> int: ...
+
+    @property
+    def theta(self) -> Array: ...
+
+    @property
+    def gravity(self) -> Array: ...
+
+    @property
+    def slides(self) -> tuple[bool, ...]: ...
+
+    def changed(self, theta: Array | None = None, gravity: Array | None = None) -> ArmDynamics: ...
+
+    def torque(self, q: Array, dq: Array, ddq: Array) -> Array: ...
+
+    def regressor(self, q: Array, dq: Array, ddq: Array) -> Array: ...
+
+    def wrench_torque(self, q: Array, wrench: Array) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +229,11 @@ def late_jit(function: Kernel) -> Kernel:
 
         return njit(cache=True, error_model="numpy")(function)
 
-    return cast(Kernel, wraps(function)(lambda *args: compiled()(*args)))
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        return compiled()(*args)
+
+    return cast(Kernel, call)
 
 
 @late_jit
@@ -585,7 +608,9 @@ class LinearEffect(LearnedEffect, JointTorque):
         """The one column."""
         return (self.column(at),)
 
-    columns = basis
+    def columns(self, at: JointSignals) -> tuple[Array, ...]:
+        """The one column."""
+        return (self.column(at),)
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Parameter times column."""

@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.spatial import Array
-
-if TYPE_CHECKING:
-    from adapter.effects.base import JointTorque
 
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 # m: a joint that slides is taken to have what one that turns a drum of this radius has
@@ -88,6 +85,16 @@ class JointSignals(NamedTuple):
         return smooth_sign(self.dq, self.ddq, self.smoothing_s, self.drum)
 
 
+class JointLaw(Protocol):
+    """A torque that a joint has by its own signals; see `effects.base.JointTorque`."""
+
+    by_load: ClassVar[bool]
+
+    def law(self, at: JointSignals, values: Mapping[str, Any]) -> Array: ...
+
+    def absent(self, n: int) -> dict[str, Array]: ...
+
+
 @dataclass(eq=False)
 class ByJoint:
     """Effects of n joints at one instant, to which each adds its own; without any all is zero.
@@ -111,7 +118,7 @@ class ByJoint:
     compliance: Array
     log_gain: Array
     delay_s: Array
-    laws: list[tuple[JointTorque, dict[str, Array]]] = field(default_factory=list)
+    laws: list[tuple[JointLaw, dict[str, Array]]] = field(default_factory=list)
     left_out: tuple[str, ...] = ()
     _taken: list[set[int]] = field(default_factory=list)
 
@@ -122,7 +129,7 @@ class ByJoint:
         wave = np.zeros(n, dtype=complex)
         return cls(np.zeros(6), offset, wave, half_play, compliance, log_gain, delay_s)
 
-    def add_law(self, effect: JointTorque, joint: int, values: Mapping[str, Any]) -> None:
+    def add_law(self, effect: JointLaw, joint: int, values: Mapping[str, Any]) -> None:
         """A law on one joint: beside its like on other joints, in a new table where taken."""
         free = (k for k, (own, _) in enumerate(self.laws) if own is effect)
         at = next((k for k in free if joint not in self._taken[k]), len(self.laws))

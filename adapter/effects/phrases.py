@@ -10,10 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from adapter.effects.base import Effect
+from typing import ClassVar, Protocol
 
 
 @dataclass(frozen=True)
@@ -125,21 +122,28 @@ SWINGS = DecidingExperiment(
 )
 
 
+class Shown(Protocol):
+    """What is asked of an effect here."""
+
+    title: ClassVar[str]
+    shows: ClassVar[tuple[tuple[DecidingExperiment, str], ...]]
+
+
 # As they stand above, in the order of preference: what is easy to do and sure comes first.
 SPLITS = tuple(x for x in globals().values() if isinstance(x, DecidingExperiment))
 
 
-def shown(effect: Effect, split: DecidingExperiment) -> str:
+def shown(effect: Shown, split: DecidingExperiment) -> str:
     """What an effect shows in an experiment."""
     return dict(effect.shows).get(split, split.untouched)
 
 
-def experiments(effect: Effect, rivals: Iterable[Effect]) -> tuple[str, ...]:
+def experiments(effect: Shown, rivals: Iterable[Shown]) -> tuple[str, ...]:
     """How to tell an effect from its rivals: a sentence for each experiment, the easiest first.
 
     A rival that no experiment tells from it is not in any.
     """
-    by_split: dict[DecidingExperiment, list[Effect]] = {}
+    by_split: dict[DecidingExperiment, list[Shown]] = {}
     for rival in rivals:
         split = next((s for s in SPLITS if shown(effect, s) != shown(rival, s)), None)
         if split is not None:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import numba
 import numpy as np
@@ -23,7 +23,6 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from adapter.model.spatial import Array, matrix_from_zxz
-from adapter.model.tree import Tree
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -106,13 +105,23 @@ class JointMotion(NamedTuple):
     ddq: Array
 
 
-def frames_of(tree: Tree, lam: Array) -> Frames:
+class Joints(Protocol):
+    """Of a tree what its frames are made of; see `model.tree.Tree`."""
+
+    @property
+    def parent(self) -> Sequence[int]: ...
+
+    @property
+    def slides(self) -> Sequence[bool]: ...
+
+
+def frames_of(tree: Joints, lam: Array) -> Frames:
     """The frames that λ (n, 6) describes."""
     lam = np.asarray(lam, dtype=np.float64)
     return placed(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:])
 
 
-def placed(tree: Tree, R0: Array, p: Array) -> Frames:
+def placed(tree: Joints, R0: Array, p: Array) -> Frames:
     """Frames at R0 (n, 3, 3), p (n, 3) m; these themselves where they lie in one piece."""
     R0, p = np.ascontiguousarray(R0), np.ascontiguousarray(p)
     return Frames(np.array(tree.parent, dtype=np.int64), R0, p, np.array(tree.slides))

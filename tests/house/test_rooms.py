@@ -41,7 +41,8 @@ FACES = {
 def graph() -> grimp.ImportGraph:
     """Every import, wherever it stands in a file, and the commands that are loaded by name."""
     whole = grimp.build_graph(*PACKAGES, cache_dir=None)
-    by_name = {"adapter.cli.main": [c.run_by.partition(":")[0] for c in COMMANDS.values()]}
+    run_by = [c.run_by or f"adapter.cli.{name}" for name, c in COMMANDS.items()]
+    by_name = {"adapter.cli.main": [name.partition(":")[0] for name in run_by]}
     by_name["adapter.cli.sim"] = [m for s in ARMS.values() for m in (s.options, s.command)]
     by_name["adapter.cli.options"] = [NAMES]
     by_name["adapter.experiments.arguments"] = [SPLIT]
