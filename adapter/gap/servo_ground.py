@@ -228,11 +228,11 @@ def find_ground(
         height = float(np.quantile(heights, share))
         one = _Together(arm, tasks, link, np.array([*usual, height]), reach_m)
         y = np.array([*point, height, 0.5 * np.log(STIFF), RUBS]) / SIZE
-        servos, cost = x, np.inf
+        servos = x
         for _ in range(2):  # a joint that got stuck starts again, beside the ground as it is now
             y, servos, cost = one.fit(y, one.best_of(y, [servos, *starts]), ROUGH)
-        if cost < least:
-            best, least = (one, y, servos), cost
+            if cost < least:
+                best, least = (one, y, servos), cost
     assert best is not None
     one, y, servos = best
     beside = one.under(one.ground(y))
@@ -240,7 +240,8 @@ def find_ground(
         np.array([fit_joint(t, ALL_FREE, own).x for t, own in zip(beside, each, strict=True)])
         for each in (servos, *starts)
     ]
-    y, servos, _ = one.fit(y, one.best_of(y, fits), FINE)
+    both = [one.fit(y, each, FINE) for each in (servos, one.best_of(y, fits))]
+    y, servos, _ = min(both, key=lambda fit: fit[2])
     pairs = zip(one.under(one.ground(y)), servos, strict=True)
     gain, left = np.zeros((2, arm.n))
     unit = np.array([chi2_unit(task, own) for task, own in pairs])
