@@ -105,7 +105,7 @@ def test_only_what_is_otherwise_than_documented_is_named() -> None:
     assert gap.after.max() < 0.1 * gap.before.max()
 
 
-@pytest.mark.parametrize("rubs", [0.0, 0.2])
+@pytest.mark.parametrize("rubs", [0.0, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_a_table_under_the_hand_is_told_from_the_servos(rubs: float) -> None:
     """It holds and pushes several joints at once, and foretells where it does in another motion."""
     free = position_arm(41, Drawn(16.0, 10e-3, 1e-4, feeds_speed=False))
