@@ -60,21 +60,19 @@ class _Together:
 
     Attributes:
         arm: its rigid part; tasks: of all its joints, without ground; link: (from 0) that touches.
-        usual: (4,) m where it is likely to, in its frame, and how high; reach_m: one standard
-            deviation of the former.
+        usual, std: (6,) of the ground's numbers before the data, and one standard deviation.
     """
 
     arm: RigidArm
     tasks: Sequence[JointTask]
     link: int
     usual: Array
-    reach_m: float
+    std: Array
 
     @cached_property
     def middles(self) -> list[Array]:
         """(m, n) rad in the middle of each step, as measured, by recording."""
-        motions = (track.smooth[0] for track in self.tasks[0].tracks)
-        return [0.5 * (q[1:] + q[:-1]) for q in motions]
+        return _middles(self.tasks)
 
     def ground(self, y: Array) -> Ground:
         """Of (6,) numbers in steps of `SIZE`."""
@@ -113,10 +111,7 @@ class _Together:
         def left(z: Array) -> Array:
             servos, tasks = servos_of(z), self.under(self.ground(z[:OWN]))
             rows = [MILLI * task.fitted(own) for task, own in zip(tasks, servos, strict=True)]
-            where = (z[:4] * SIZE[:4] - self.usual) / [*[self.reach_m] * 3, HEIGHT_M]
-            stiff = (z[4] * SIZE[4] - 0.5 * np.log(STIFF)) / np.log(YIELDS)
-            rubs = (z[5] * SIZE[5] - RUBS) / RUBS_STD
-            return np.concatenate([*rows, held * where, [held * stiff, held * rubs]])
+            return np.concatenate([*rows, held * (z[:OWN] * SIZE - self.usual) / self.std])
 
         def slopes(z: Array, here: Array) -> Array:
             servos = servos_of(z)
@@ -194,6 +189,12 @@ def robust_fit(
     return z, cost
 
 
+def _middles(tasks: Sequence[JointTask]) -> list[Array]:
+    """(m, n) rad in the middle of each step, as measured, by recording."""
+    motions = (track.smooth[0] for track in tasks[0].tracks)
+    return [0.5 * (q[1:] + q[:-1]) for q in motions]
+
+
 def _beyond(arm: RigidArm, link: int, way_m: float) -> Array:
     """(3,) m so far beyond the centre of mass of a link, in its frame."""
     centre = arm.theta[link, 1:4] / max(float(arm.theta[link, 0]), 1e-9)
@@ -221,18 +222,19 @@ def find_ground(
     points = [(*tip, tip[1], TIP_M) for tip in tips]
     for link, beyond in product(() if tips else range(max(arm.n - 2, 0), arm.n), BEYOND_M):
         points.append((link, _beyond(arm, link, beyond), _beyond(arm, link, FAR_M), REACH_M))
-    for (link, point, usual, reach_m), share in product(points, LOWEST):
-        level = Ground(link, point, -arm.gravity / np.linalg.norm(arm.gravity), 0.0, 1.0)
-        motions = (0.5 * (track.smooth[0, 1:] + track.smooth[0, :-1]) for track in tasks[0].tracks)
+    up, motions = -arm.gravity / np.linalg.norm(arm.gravity), _middles(tasks)
+    for link, point, usual, reach_m in points:
+        level = Ground(link, point, up, 0.0, 1.0)
         heights = np.concatenate([over_ground(arm, level, q)[1] for q in motions])
-        height = float(np.quantile(heights, share))
-        one = _Together(arm, tasks, link, np.array([*usual, height]), reach_m)
-        y = np.array([*point, height, 0.5 * np.log(STIFF), RUBS]) / SIZE
-        servos = x
-        for _ in range(2):  # a joint that got stuck starts again, beside the ground as it is now
-            y, servos, cost = one.fit(y, one.best_of(y, [servos, *starts]), ROUGH)
-            if cost < least:
-                best, least = (one, y, servos), cost
+        std = np.array([*[reach_m] * 3, HEIGHT_M, np.log(YIELDS), RUBS_STD])
+        for height in np.quantile(heights, LOWEST):
+            rest = height, 0.5 * np.log(STIFF), RUBS
+            one = _Together(arm, tasks, link, np.array([*usual, *rest]), std)
+            y, servos = np.array([*point, *rest]) / SIZE, x
+            for _ in range(2):  # a joint that got stuck starts again, beside the ground as it is
+                y, servos, cost = one.fit(y, one.best_of(y, [servos, *starts]), ROUGH)
+                if cost < least:
+                    best, least = (one, y, servos), cost
     assert best is not None
     one, y, servos = best
     beside = one.under(one.ground(y))
