@@ -37,8 +37,10 @@ from adapter.screening.screen import RecordingRefused
 from adapter.simulate import Rollouts
 from drivers.files.mcap import Log, read_log, read_position_log
 
-WITH_TORQUE = ["validate_from", "rounds", "turn_or_zero", "tau", "trust_log"]
-WITH_TORQUE += ["tau_gain", "gear", "known_load"]  # options
+WITH_TORQUE = (  # options
+    *("validate_from", "rounds", "turn_or_zero", "tau", "trust_log"),
+    *("tau_gain", "gear", "known_load"),
+)
 
 
 def run(args: argparse.Namespace) -> int:

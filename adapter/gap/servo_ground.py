@@ -111,7 +111,8 @@ class _Together:
         def left(z: Array) -> Array:
             servos, tasks = servos_of(z), self.under(self.ground(z[:OWN]))
             rows = [MILLI * task.fitted(own) for task, own in zip(tasks, servos, strict=True)]
-            return np.concatenate([*rows, held * (z[:OWN] * SIZE - self.usual) / self.std])
+            off = (z[:OWN] * SIZE - self.usual) / self.std
+            return np.concatenate([*rows, held * off])
 
         def slopes(z: Array, here: Array) -> Array:
             servos = servos_of(z)

@@ -105,7 +105,7 @@ def _change_words(change: Change) -> str:
         named = {key: "" if key == GRAVITY else f"{key} " for key in values}
         told = {key: " -> ".join(map(_number, pair)) for key, pair in values.items()}
         words = ", ".join(f"{named[key]}{told[key]} {change.units[key]}" for key in values)
-    if change.shown >= 0.5:
+    if change.shown >= 0.5:  # mostly: nothing is to be told
         return words
     share = f"{100.0 * change.shown:.2g} % of it" if change.shown else "none of it"
     return f"{words} (data can show {share})"

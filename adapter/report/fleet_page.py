@@ -22,6 +22,7 @@ from adapter.runs.fleet.course import Drift
 from adapter.runs.fleet.fleet import Fleet
 
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
+FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 MOST_ROWS = 300  # of recordings on the page; of more those to say something of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
@@ -50,7 +51,7 @@ def _log_cells(log: OfLog) -> tuple[str, ...]:
         "" if log.load is None else _signed(*log.load),
         f"{log.rmse[worst]:.3f} ({worst + 1})",
         _less(log.worth),
-        " ".join(map(str, log.disagrees)) if len(log.disagrees) < 4 else "everywhere",
+        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
     )
 
 
@@ -112,8 +113,10 @@ def sentences(arm: FleetArm) -> list[str]:
     used = [(x, name) for name, x in zip(names, arm.logs, strict=True) if x.used]
     if len(used) > 1:
         best, name = max(used, key=lambda one: one[0].worth)
-        less = f"deviations would be {_less(best.worth)} less (geometric mean)"
-        found.append(f"The motion of {name} would teach most if repeated: standard {less}")
+        found.append(
+            f"The motion of {name} would teach most if repeated: standard deviations would be "
+            f"{_less(best.worth)} less (geometric mean)"
+        )
     return found
 
 
@@ -213,8 +216,10 @@ def _parameters(arm: FleetArm) -> Table:
         mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
         values = [with_doubt(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
         rows.append([name, with_doubt(*mass), *values])
-    note = "A mass without a standard deviation is the documentation's: torques show it in sums"
-    return Table(heads, rows, units, f"{note} only.")
+    note = (
+        "A mass without a standard deviation is the documentation's: torques show it in sums only."
+    )
+    return Table(heads, rows, units, note)
 
 
 def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -134,11 +135,18 @@ def shown_joints(result: GapResult) -> list[int]:
     return chosen[:MOST_JOINTS] or ranked[:1]
 
 
-def signature_panels(result: GapResult) -> list[dict[str, Any]]:
-    """The residual of the joints worth a look, against what it may depend on.
+@dataclass(frozen=True)
+class JointPanels:
+    """Panels of one joint: clouds of its residual, and its residual and motion over time."""
 
-    Of each the title, why it is shown, clouds of the residual, and panels over time.
-    """
+    title: str
+    why: str
+    clouds: Sequence[Panel]
+    times: Sequence[Panel]
+
+
+def signature_panels(result: GapResult) -> list[JointPanels]:
+    """The residual of the joints worth a look, against what it may depend on."""
     panels = []
     for j in shown_joints(result):
         clouds = []
@@ -158,9 +166,8 @@ def signature_panels(result: GapResult) -> list[dict[str, Any]]:
         ]
         said += ["something unexplained"] * any(x.joint == j + 1 for x in result.unexplained)
         why += [", ".join(dict.fromkeys(said))] if said else []
-        words = {"title": f"Joint {j + 1}", "why": "; ".join(why)}
         times = [_over_time(result, j), _motion(result, j)]
-        panels.append({**words, "clouds": clouds, "times": times})
+        panels.append(JointPanels(f"Joint {j + 1}", "; ".join(why), clouds, times))
     return panels
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,7 +28,19 @@ def tied(text: str) -> str:
     return UNIT.sub(lambda found: NARROW + found[1].replace(" ", NARROW), text)
 
 
-def finding_row(findings: Sequence[Finding]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class FindingRow:
+    """A finding as it stands in the table."""
+
+    what: str
+    where: str
+    when: str
+    values: list[str]
+    evidence: str
+    worth: str
+
+
+def finding_row(findings: Sequence[Finding]) -> FindingRow:
     """What, where, when, how much, how sure: one row for what is the same on several joints."""
     first = findings[0]
     ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
@@ -47,8 +59,8 @@ def finding_row(findings: Sequence[Finding]) -> dict[str, Any]:
         owners = [f.recording or who(f.effect, f.joints) for f in ordered]
         values = [f"{x}: {', '.join(own)}" for x, own in zip(owners, lines, strict=True)]
     evidence = sure if alone or least >= 0.999 else f"{sure} and more"
-    row = {"what": capital(first.title), "where": who(first.effect, joints), "when": when}
-    return {**row, "values": values, "evidence": evidence, "worth": _worth(ordered)}
+    what, where = capital(first.title), who(first.effect, joints)
+    return FindingRow(what, where, when, values, evidence, _worth(ordered))
 
 
 def in_matrix(findings: Sequence[Finding]) -> bool:

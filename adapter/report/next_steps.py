@@ -19,12 +19,16 @@ LEARNED_SHARE = 0.7  # of a recording that is learned from where the rest is hel
 LONGER = 2.0  # times the duration of a run that was too short
 SIMULATED = "pybullet"
 # Options that make a recording readable, which whoever reads it next needs, too
-HOW_READ = ["--topic", "--turn", "--zero", "--tau", "--tau-gain", "--gear", "--known-load"]
-HOW_READ += ["--loaded", "--trust-log"]
+HOW_READ = (
+    *("--topic", "--turn", "--zero", "--tau", "--tau-gain", "--gear", "--known-load", "--loaded"),
+    "--trust-log",
+)
 # Options of a run that the next one does not repeat
-ITS_OWN = ["--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"]
-ITS_OWN += ["--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"]
-ITS_OWN += ["--foxglove", "--fault", "--record", "--overwrite"]
+ITS_OWN = (
+    *("--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"),
+    *("--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"),
+    *("--foxglove", "--fault", "--record", "--overwrite"),
+)
 
 
 @dataclass(frozen=True)

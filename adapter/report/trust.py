@@ -163,6 +163,7 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
 
 GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
 LEFT = "Torque not explained"
+FEW_MISSED, MANY_MISSED = 1e-3, 1e-2  # shares of all deadlines
 
 
 @dataclass(frozen=True)
@@ -325,8 +326,8 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
             f"{quantity(plant.get('p99'), 'µs')}, which waits where it is late: nothing is lost"
         )
     share = missed / deadlines
-    bad = share >= 1e-2 and not is_simulated(figures)
-    verdict = GOOD if share < 1e-3 else BAD if bad else LOOK
+    bad = share >= MANY_MISSED and not is_simulated(figures)
+    verdict = GOOD if share < FEW_MISSED else BAD if bad else LOOK
     return Check(verdict, "Timing", said)
 
 

@@ -66,7 +66,7 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
     odds = np.exp(np.array(evidence) - max(evidence))
     for name in Kind:
         share = sum(own for own, other in zip(odds, names, strict=True) if other == name)
-        if share > 0.9 * odds.sum():
+        if share > 0.9 * odds.sum():  # probable
             return name
     return Kind.OPEN
 

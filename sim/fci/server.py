@@ -238,7 +238,7 @@ class FciServer:
             self._ticks.restart()
             while not stop():
                 if self._session is None and not self.robot.moving:
-                    wait_s = IDLE_S if self.hand is None else 0.01
+                    wait_s = IDLE_S if self.hand is None else 0.01  # s, as often as it has a state
                     select.select([self._listener], [], [], wait_s)
                     self._ticks.restart()
                     if self.hand is not None:

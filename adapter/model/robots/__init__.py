@@ -96,7 +96,7 @@ def facts_of(model: SelfModel) -> RobotFacts | None:
     for robot in same:
         own = robot.model.limits
         apart = np.abs([own.lower - its.lower, own.upper - its.upper])
-        limited += [robot] if (apart < 0.02).all() else []
+        limited += [robot] if (apart < 0.02).all() else []  # rad
     named = [robot for robot in same if model.name.lower().startswith(robot.names)]
     return next(iter(limited or named), None)
 
