@@ -10,11 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.gap.hand import FACES, hand_frame
 from adapter.gap.result import RolloutCurves
 from adapter.gap.servo_fit import (
     ALL_FREE,
+    BY_GAIN,
     PARAMETERS,
     Freedom,
     JointFit,
@@ -36,6 +38,7 @@ from adapter.gap.servo_kernels import (
     NO_GROUND,
     PLAY,
     RUBS,
+    STICKS,
     TIGHT,
     WITHIN,
     A,
@@ -64,6 +67,7 @@ NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
 HAND_ROWS = 500  # of a recording, where the way of the hand is told
 ROUGH_STEP_S = 8e-3  # of the first simulations
+STATIC_SHARE = 0.3  # of Coulomb friction, at which static friction is first tried
 # what a limit, a dead band or backlash has to tell of blocks not seen, and its share of what was
 # left: simulated ones explain nearly all of it, on a real arm a wrong one explained a tenth
 LIMITED_CHI2, LIMITED_SHARE = 12.0, 0.25
@@ -89,13 +93,13 @@ class _Arm:
     tips: tuple[Tip, ...] = ()
 
     def fixed(self, j: int) -> Array:
-        """(10,) documented parameters of a joint, as `Freedom` takes them."""
+        """(11,) documented parameters of a joint, as `Freedom` takes them."""
         servos = self.documented
         x = servos.table()[j]
         kp = servos.position_gain[j]
         x[WITHIN] = x[WITHIN] / x[DAMPING] if x[DAMPING] > 0.0 else 0.0
         if np.isfinite(kp):
-            x[LEAD:DELAY] *= kp
+            x[BY_GAIN] *= kp
             x[TIGHT] /= kp
         return x
 
@@ -251,10 +255,12 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
         tasks = replace(arm, tracks=tracks).tasks(motions)
     if arm.documented.is_ideal:
         arm = replace(arm, usual=float(np.median(x[:, A])))
+    x[:, STICKS] = STATIC_SHARE * x[:, RUBS]
     fits = [
-        _limited(JointFit(replace(task, usual=arm.usual), fit.freedom, own), noise[j])
-        for j, (task, fit, own) in enumerate(zip(tasks, fits, x, strict=True))
+        fit_joint(replace(task, usual=arm.usual), fit.freedom.beside(STICKS), own)
+        for task, fit, own in zip(tasks, fits, x, strict=True)
     ]
+    fits = [_limited(fit, noise[j]) for j, fit in enumerate(fits)]
     tasks = arm.tasks([track.smooth for track in arm.tracks])
     return arm, [fit_joint(task, fit.freedom, fit.x) for task, fit in zip(tasks, fits, strict=True)]
 
@@ -278,8 +284,14 @@ def _limited(fit: JointFit, noise: float) -> JointFit:
         best = min(fits, key=JointFit.error, default=fit)
         if not _explains(best, fit):
             break
-        earlier, fit = np.flatnonzero(fit.freedom.free[:WITHIN]), best
-        for k in earlier[earlier > DELAY]:  # what stood in for what is there now
+        fit = _needed(best, fit.freedom.free)  # what stood in for what is there now goes
+    return fit
+
+
+def _needed(fit: JointFit, asked: NDArray[np.bool_]) -> JointFit:
+    """A fit without those limits asked for, (11,), that explain too little beside the rest."""
+    for k in range(TIGHT, WITHIN):
+        if asked[k] and fit.freedom.free[k]:
             without = fit_joint(fit.task, fit.freedom.without(k), fit.x)
             fit = fit if _explains(fit, without) else without
     return fit
@@ -302,7 +314,8 @@ def _named(arm: _Arm, fits: list[JointFit], progress: Callable[[str], None]) -> 
     for _ in range(ROUNDS):
         tasks = arm.tasks(_motions(arm, fits))
         fits = [fit_joint(t, f.freedom, f.x) for t, f in zip(tasks, fits, strict=True)]
-    fits = _with_lead(arm, fits)
+    # what a limit explained on long steps, and under noisy loads, may be explained by now
+    fits = _with_lead(arm, [_needed(fit, fit.freedom.free) for fit in fits])
     fits = _with_one_delay(arm, fits)
     tasks = arm.tasks(_motions(arm, fits))
     fits = [
@@ -401,10 +414,10 @@ def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]
 
 
 def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Array, Array]:
-    """A servo's numbers (9,), SI, and their covariance (9, 9), in the order of the table's columns.
+    """A servo's numbers (10,), SI, and their covariance (10, 10), as the table's columns.
 
-    kp, gain of the command's speed, damping, armature, Coulomb, delay (no doubt of it), one over
-    the torque's limit, dead band, half the backlash.
+    kp, gain of the command's speed, damping, armature, Coulomb, delay (no doubt of it), stiction,
+    one over the torque's limit, dead band, half the backlash.
 
     Args:
         others: loads of arms whose inertias are as wrong as they may be.
@@ -419,7 +432,7 @@ def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Arra
             own = own + moved.T @ moved / len(moved)
         covariance[np.ix_(free, free)] = own * np.outer(fit.scale, fit.scale)
     # to the power of the gain that each has in the table
-    power = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, 0.0, 0.0])
+    power = BY_GAIN[:WITHIN] - 1.0 * (np.arange(WITHIN) == TIGHT)
     values = x[:WITHIN] / a**power
     turn = np.zeros((WITHIN, PARAMETERS))
     turn[:, :WITHIN] = np.diag(fit.freedom.free[:WITHIN] / a**power)
@@ -451,6 +464,7 @@ def _servos(arm: _Arm, fits: Sequence[JointFit]) -> ServoModel:
         np.asarray(fed),
         float(np.median(x[:, DELAY])),
         arm.ground,
+        x[:, STICKS] * kp,
         _limit(x[:, TIGHT], kp),
         x[:, DEAD],
         2.0 * x[:, PLAY],

@@ -14,6 +14,7 @@ import numpy as np
 from adapter.effects.robots import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.phrases import numbered
+from adapter.gap.servo_kernels import SLIP
 from adapter.gap.servo_model import ServoModel
 from adapter.model.mjcf_drives import Drives, Floor, with_drives
 from adapter.model.self_model import SelfModel
@@ -51,6 +52,8 @@ def drives_of(servos: ServoModel, model: SelfModel) -> Drives:
         servos.torque_limit,
         servos.feeds_speed,
         damping / (own_inertia(model) + servos.armature),
+        servos.stiction,
+        SLIP,
         servos.delay_s,
         floor,
     )
@@ -73,7 +76,8 @@ def servo_mjcf(
     Raises:
         ModelError: as of `robot_mjcf`; the servos are ideal; MuJoCo refuses the result.
     """
-    written = robot_mjcf(with_servos(model, servos), onto, alone)
+    holds = replace(servos, coulomb=servos.coulomb + servos.stiction)  # less what falls with speed
+    written = robot_mjcf(with_servos(model, holds), onto, alone)
     file = None if written.onto is None else Path(written.onto)
     text, notes = with_drives(written.text, model, drives_of(servos, model), file)
     lacks = [
@@ -93,5 +97,5 @@ def servo_urdf(
 ) -> RobotText:
     """URDF of an arm with what there is a place for: friction. Raises ModelError."""
     written = robot_urdf(with_servos(model, servos), onto, alone)
-    note = "a URDF has no place for the servos' gains and delay; --mjcf has"
+    note = "a URDF has no place for the servos' gains, delay and static friction; --mjcf has"
     return replace(written, notes=(*written.notes, note))

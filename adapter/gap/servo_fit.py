@@ -21,6 +21,7 @@ from adapter.gap.servo_kernels import (
     LEAD,
     PLAY,
     RUBS,
+    STICKS,
     TIGHT,
     WITHIN,
     A,
@@ -30,15 +31,17 @@ from adapter.gap.servo_kernels import (
 from adapter.gap.servo_signals import Track, smoothed
 from adapter.model.spatial import Array
 
-PARAMETERS, PLAIN = 10, 5  # in all; those that an equation without limits has
+PARAMETERS, PLAIN = 11, 5  # in all; those that an equation without limits has
 # where edges of limits (of the most that a motion took, at `FULL` of its rows) and of dead bands
 # (shares of rows) start, and how far beyond the latter what is driven is free of chatter
 FULL, LIMITED, DULL, BEYOND = 0.98, (1.1, 0.9, 0.7), (0.05, 0.15, 0.3, 0.5), 1.4
 LATEST_S, EVERY_S = 0.05, 1e-3  # of the delays that are tried
+USUAL_HZ = 5.0  # at which position loops of arms close: 1 to 20
 BLOCK_S = 2.0  # of alternating blocks
 MEMORY_S = 0.5  # beyond which what is left of a fit does not know itself
+BY_GAIN = np.isin(np.arange(PARAMETERS), (LEAD, DAMPING, INERTIA, RUBS, STICKS))  # over kp
 # scale of a parameter that is zero; WITHIN follows from the others
-LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3, 0.3, 2e-4, 2e-4, 1.0])
+LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3, 1e-4, 0.3, 2e-4, 2e-4, 1.0])
 NUDGE = 1e-3  # of its scale, for derivatives
 OUTLIER_RAD = 5e-3  # beyond which what the model does not know is no noise
 FAR_RAD = 10.0  # at which a simulated motion that runs away is cut
@@ -65,7 +68,7 @@ class JointTask:
     usual: float = 0.0
 
     def left(self, x: Array) -> list[Array]:
-        """What (10,) parameters leave of each recording's readings (k,), rad."""
+        """What (11,) parameters leave of each recording's readings (k,), rad."""
         found = []
         for track, load in zip(self.tracks, self.loads, strict=True):
             one = track.only(self.joint)
@@ -86,8 +89,8 @@ class Freedom:
     """Which parameters are free, and what the others are.
 
     Attributes:
-        free: (10,) bool.
-        documented: (10,) of the fixed ones; those between `LEAD` and `RUBS` times the position
+        free: (11,) bool.
+        documented: (11,) of the fixed ones; those of `BY_GAIN` times the position
             gain, and `TIGHT` over it, in SI, so that they stay what they are while the gain is
             sought. `WITHIN` is a share of the damping, where no command's speed is fed forward.
     """
@@ -96,18 +99,16 @@ class Freedom:
     documented: Array
 
     def full(self, part: Array) -> Array:
-        """(10,) from the free ones."""
+        """(11,) from the free ones."""
         x = self.documented.copy()
         x[self.free] = part
-        scaled = ~self.free
-        scaled[[A, *range(DELAY, PARAMETERS)]] = False
-        x[scaled] *= x[A]
+        x[~self.free & BY_GAIN] *= x[A]
         if not self.free[TIGHT]:
             x[TIGHT] /= x[A] if x[A] > 0.0 else 1.0
         x[WITHIN] = x[LEAD] if x[LEAD] > 0.0 else x[WITHIN] * x[DAMPING]
         return x
 
-    def beside(self, k: int, within: float | None) -> Freedom:
+    def beside(self, k: int, within: float | None = None) -> Freedom:
         """With one parameter more, and another share of the damping within the torque's limit."""
         free, documented = self.free.copy(), self.documented.copy()
         free[k] = True
@@ -130,9 +131,9 @@ class JointFit:
     """A joint's servo, fitted.
 
     Attributes:
-        task, freedom: of what, and how; x: (10,).
+        task, freedom: of what, and how; x: (11,).
         delay_std: s, of the delay that all joints share.
-        values, doubt: (9,) in SI and (9, 9) their covariance, once they were weighed.
+        values, doubt: (10,) in SI and (10, 10) their covariance, once they were weighed.
     """
 
     task: JointTask
@@ -208,7 +209,7 @@ def blocks(task: JointTask, part: int) -> JointTask:
 
 
 def fit_joint(task: JointTask, freedom: Freedom, start: Array) -> JointFit:
-    """Fit by output error from (10,) parameters on."""
+    """Fit by output error from (11,) parameters on."""
     x = start.copy()
     scale = np.maximum(np.abs(x), LEAST)[freedom.free]
     if not freedom.free.any():
@@ -257,18 +258,21 @@ def _slopes(task: JointTask, freedom: Freedom, part: Array, scale: Array) -> Arr
 
 
 def first_guess(task: JointTask) -> Array:
-    """(10,) by equation error on smooth signals, the delay by trying."""
+    """(11,) by equation error on smooth signals, the delay by trying."""
     best, least, equation = np.zeros(PARAMETERS), np.inf, equations(task)
     for delay in np.arange(0.0, LATEST_S, EVERY_S):
         matrix, wanted = equation(delay)
         x, left = _solved(matrix[:, :PLAIN], wanted)
         if left < least:
-            least, best = left, np.array([*x, delay, 0.0, 0.0, 0.0, 0.0])
+            least, best = left, np.array([*x, delay, *np.zeros(PARAMETERS - DELAY - 1)])
+    if best[A] < LEAST[A]:  # a servo that no load moves: the equation does not hold
+        mass = np.median(np.concatenate([load.mass for load in task.loads]))
+        best[A] = 1.0 / (mass * (2.0 * np.pi * USUAL_HZ) ** 2)
     return best
 
 
 def guesses(equation: Callable[[float], tuple[Array, Array]], x: Array, k: int) -> list[Array]:
-    """Starts (10,) of a fit with one number more, k, beside those that there are, x (10,).
+    """Starts (11,) of a fit with one number more, k, beside those that there are, x (11,).
 
     Where a limit or a dead band acts, the equation does not hold; so the rest tells the others.
     """

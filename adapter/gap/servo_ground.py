@@ -144,7 +144,7 @@ class _Together:
         return np.array([misfit(task.fitted(own)) for task, own in pairs])
 
     def best_of(self, y: Array, servos: Sequence[Array]) -> Array:
-        """(n, 10) of several, joint by joint those that leave least."""
+        """(n, 11) of several, joint by joint those that leave least."""
         errors = np.array([self.errors(self.ground(y), x) for x in servos])
         return np.array(servos)[errors.argmin(axis=0), np.arange(self.arm.n)]
 
@@ -205,10 +205,10 @@ def _beyond(arm: RigidArm, link: int, way_m: float) -> Array:
 def find_ground(
     arm: RigidArm, tasks: Sequence[JointTask], x: Array, tips: Sequence[Tip]
 ) -> tuple[Ground, Array]:
-    """What the hand comes down on (`NO_GROUND` if nothing pays), and the servos (n, 10) beside it.
+    """What the hand comes down on (`NO_GROUND` if nothing pays), and the servos (n, 11) beside it.
 
     Args:
-        tasks: of all joints, without ground; x: (n, 10) servos fitted without.
+        tasks: of all joints, without ground; x: (n, 11) servos fitted without.
         tips: documented, beyond which there is nothing: where there are some, nothing else touches.
     """
     best, least = None, np.inf

@@ -3,10 +3,11 @@
 A servo, divided by its position gain kp (so that what encoders alone show stands apart from the
 scale that only the documented masses set):
 
-    q_cmd(t - d) - q + lead dq_cmd(t - d) = a tau_rigid + inertia ddq + damping dq + rubs sign(dq)
+    q_cmd(t - d) - q + lead dq_cmd(t - d) = a tau_rigid + inertia ddq + damping dq + f(dq) sign(dq)
 
 with a = 1 / kp, lead the fed-forward speed's gain over kp (s), damping (s) that of the velocity
-gain and viscous friction together, inertia the armature's (s²), rubs Coulomb friction's (rad).
+gain and viscous friction together, inertia the armature's (s²), and f = rubs + sticks max(0, 1 -
+|dq| / SLIP) dry friction: Coulomb's, and what it takes more to break a joint loose (rad).
 A servo may drive nothing while its error is within `dead` (rad), and no harder than at an error of
 1 / tight (rad), the part `within` (s) of its damping included. A gear with backlash gives way to
 its load by `play` (rad), half of what it has: the motor, by which the servo steers, is ahead by it.
@@ -31,9 +32,13 @@ from adapter.physics.kernels import (
 )
 
 SWEEPS, SETTLED = 60, 1e-9  # of the joints' speeds in a step; rad/s
+# rad/s (or m/s) where a joint slides: Stribeck's curve as a line, which simulators can hold. It has
+# the area of one of 0.1, the upper end of published ones of gears; on a real arm unseen motions are
+# foretold as well with 0.1 to 0.3 as with a curve
+SLIP = 0.2
 
 # columns of a table of servos; the delay acts on commands, before all this
-A, LEAD, DAMPING, INERTIA, RUBS, DELAY, TIGHT, DEAD, PLAY, WITHIN = range(10)
+A, LEAD, DAMPING, INERTIA, RUBS, DELAY, STICKS, TIGHT, DEAD, PLAY, WITHIN = range(11)
 LEAST_LOAD = 0.02  # N m, from which on a gear rests on one side of its play
 
 
@@ -179,8 +184,14 @@ def between(at, t, table, out):
 
 
 @jit
+def dry_friction(x, speed):
+    """Of a servo x (11,) at a speed, rad."""
+    return x[RUBS] + x[STICKS] * max(0.0, 1.0 - abs(speed) / SLIP)
+
+
+@jit
 def kept_back(x, error, moves, damps):
-    """What the drive of a servo x (10,) lacks, rad, in the mean of a step.
+    """What the drive of a servo x (11,) lacks, rad, in the mean of a step.
 
     Means over a straight way, so that edges within a step come out as they are.
 
@@ -210,13 +221,13 @@ def follow_alone(x, goal, load, start, step, q):
     """One joint under its commands, the others' motion known.
 
     Args:
-        x: (10,) the servo.
+        x: (11,) the servo.
         goal: (2, m) q_cmd, and lead dq_cmd, over each step, rad.
         load: `Load`; start: (2,) q, dq before the first step; step: s.
         q: (m,) rad after each step, filled.
     """
     at, speed = start[0], start[1]
-    damping, rubs = x[DAMPING], x[RUBS]
+    damping = x[DAMPING]
     for k in range(goal.shape[1]):
         mass = x[A] * load.mass[k] + x[INERTIA]
         steers, holds = goal[0, k] - x[PLAY] * load.side[k], 1.0
@@ -228,7 +239,7 @@ def follow_alone(x, goal, load, start, step, q):
         left = step
         if speed != 0.0:
             way = 1.0 if speed > 0.0 else -1.0
-            pull = 2.0 * mass / step * speed + steers - holds * at - way * rubs
+            pull = 2.0 * mass / step * speed + steers - holds * at - way * dry_friction(x, speed)
             after = 2.0 * pull / (2.0 * mass / step + 0.5 * step * holds + damping) - speed
             # It stops within the step: only up to there does friction act this way. What follows
             # from the numbers then has no jumps, which a fit would be caught by.
@@ -236,7 +247,7 @@ def follow_alone(x, goal, load, start, step, q):
             at += 0.5 * share * step * (speed + (after if share == 1.0 else 0.0))
             speed = after if share == 1.0 else 0.0
             left = (1.0 - share) * step
-        force = steers - holds * at
+        force, rubs = steers - holds * at, x[RUBS] + x[STICKS]
         if left > 0.0 and abs(force) > rubs:
             force -= rubs if force > 0.0 else -rubs
             middle = force / (2.0 * mass / left + 0.5 * left * holds + damping)
@@ -249,7 +260,7 @@ def follow_together(x, goal, body, start, step, q):
     """All joints under their commands.
 
     Args:
-        x: (n, 10) the servos; goal: (2, m, n) as for one joint.
+        x: (n, 11) the servos; goal: (2, m, n) as for one joint.
         body: `Body`; start: (2, n) q, dq before the first step; step: s.
         q: (m, n) rad after each step, filled.
     """
@@ -259,7 +270,7 @@ def follow_together(x, goal, body, start, step, q):
     bias, column, base = np.empty(n), np.empty(n), np.zeros(12)
     mass, pull, ahead = np.empty((n, n)), np.empty(n), np.empty(n)
     before, way, place, anchor = speed.copy(), np.zeros((3, n)), np.ones(3), np.zeros(2)
-    carries, stiff = np.zeros(n), np.zeros((n, n))
+    carries, stiff, rubs = np.zeros(n), np.zeros((n, n)), np.zeros(n)
     for k in range(goal.shape[1]):
         if body.ground.root > 0.0:
             over_ground(body.frames, body.ground, at, way, place)
@@ -302,6 +313,7 @@ def follow_together(x, goal, body, start, step, q):
                 error -= x[j, PLAY] * carried / np.hypot(carried, LEAST_LOAD)
             damps = goal[1, k, j] - x[j, WITHIN] * speed[j]
             pull[j] += error - kept_back(x[j], error, step * speed[j], damps)
+            rubs[j] = dry_friction(x[j], speed[j])
         for _ in range(SWEEPS):
             change = 0.0
             for j in range(n):
@@ -313,8 +325,8 @@ def follow_together(x, goal, body, start, step, q):
                 own = 2.0 / step * (x[j, A] * mass[j, j] + x[j, INERTIA])
                 own += 0.5 * step * x[j, A] * stiff[j, j]
                 new = 0.0
-                if abs(left) > x[j, RUBS]:
-                    left -= x[j, RUBS] if left > 0.0 else -x[j, RUBS]
+                if abs(left) > rubs[j]:
+                    left -= rubs[j] if left > 0.0 else -rubs[j]
                     new = left / (own + 0.5 * step + x[j, DAMPING])
                 change = max(change, abs(new - middle[j]))
                 middle[j] = new

@@ -22,6 +22,7 @@ from adapter.gap.servo_kernels import (
     NO_GROUND,
     PLAY,
     RUBS,
+    STICKS,
     TIGHT,
     WITHIN,
     A,
@@ -35,7 +36,8 @@ from adapter.physics.kernels import base_at_rest
 from adapter.physics.rigid_arm import RigidArm
 
 KEYS = ("position_gain", "velocity_gain", "coulomb", "viscous", "armature")
-LIMITS = {"torque_limit": np.inf, "dead_band": 0.0, "backlash": 0.0}  # where there is none
+# keys that a joint need not have, and what they are where there is none
+OTHERS = {"stiction": 0.0, "torque_limit": np.inf, "dead_band": 0.0, "backlash": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,8 @@ class ServoModel:
         feeds_speed: (n,) whether the velocity gain acts on the command's speed less the joint's.
             Where it does not, velocity gain and viscous friction do the same: their sum counts.
         ground: what the hand comes down on, if anything.
+        stiction: N m, by which breaking a joint loose takes more than Coulomb friction; it falls
+            in a line to nothing at `SLIP`.
         torque_limit: N m, of what both gains ask for; dead_band: rad, of an error that drives
             nothing; backlash: rad, of the gear, from end to end, where servos steer by their
             motors and readings are of the links.
@@ -65,12 +69,13 @@ class ServoModel:
     feeds_speed: NDArray[np.bool_]
     delay_s: float = 0.0
     ground: Ground = NO_GROUND
+    stiction: Array = field(default_factory=lambda: np.zeros(()))
     torque_limit: Array = field(default_factory=lambda: np.array(np.inf))
     dead_band: Array = field(default_factory=lambda: np.zeros(()))
     backlash: Array = field(default_factory=lambda: np.zeros(()))
 
     def __post_init__(self) -> None:
-        for key in LIMITS:  # one number for all joints, too
+        for key in OTHERS:  # one number for all joints, too
             each = np.broadcast_to(getattr(self, key), len(self.joint_names))
             object.__setattr__(self, key, np.array(each, dtype=float))
 
@@ -87,13 +92,14 @@ class ServoModel:
         return bool(np.isinf(self.position_gain).any())
 
     def table(self) -> Array:
-        """(n, 10) as the compiled simulation takes it."""
-        x = np.zeros((len(self.joint_names), 10))
+        """(n, 11) as the compiled simulation takes it."""
+        x = np.zeros((len(self.joint_names), WITHIN + 1))
         x[:, A] = 1.0 / self.position_gain
         x[:, LEAD] = x[:, A] * self.velocity_gain * self.feeds_speed
         x[:, DAMPING] = x[:, A] * (self.velocity_gain + self.viscous)
         x[:, INERTIA] = x[:, A] * self.armature
         x[:, RUBS] = x[:, A] * self.coulomb
+        x[:, STICKS] = x[:, A] * self.stiction
         x[:, DELAY] = self.delay_s
         limited = np.isfinite(self.torque_limit)
         x[limited, TIGHT] = self.position_gain[limited] / self.torque_limit[limited]
@@ -129,7 +135,7 @@ class ServoModel:
             lines += [f"{key} = {float(getattr(self, key)[j]):.6g}" for key in KEYS]
             lines += [
                 f"{key} = {float(getattr(self, key)[j]):.6g}"
-                for key, none in LIMITS.items()
+                for key, none in OTHERS.items()
                 if getattr(self, key)[j] != none
             ]
             lines.append(f"feeds_speed = {str(bool(self.feeds_speed[j])).lower()}")
@@ -166,9 +172,9 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
     if not isinstance(joints, list) or not all(isinstance(j, dict) for j in joints):
         raise ModelError(f"{path}: needs a [[joint]] for each joint, with name and {KEYS[0]}")
     strange = [key for key in facts if key not in ("delay_s", "joint", "ground")]
-    strange += [k for j in joints for k in j if k not in (*KEYS, *LIMITS, "name", "feeds_speed")]
+    strange += [k for j in joints for k in j if k not in (*KEYS, *OTHERS, "name", "feeds_speed")]
     if strange:
-        choices = ", ".join(("delay_s", "ground", "name", *KEYS, *LIMITS, "feeds_speed"))
+        choices = ", ".join(("delay_s", "ground", "name", *KEYS, *OTHERS, "feeds_speed"))
         raise ModelError(f"{path}: does not know {', '.join(strange)}; have: {choices}")
     told = {j.get("name"): j for j in joints}
     missing = [name for name in joint_names if name not in told]
@@ -180,7 +186,7 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
     found: dict[str, Any] = {
         key: np.array([_number(path, row, key, key == KEYS[0]) for row in rows]) for key in KEYS
     }
-    for key, none in LIMITS.items():
+    for key, none in OTHERS.items():
         found[key] = np.array(
             [_number(path, row, key, none > 0.0) if key in row else none for row in rows]
         )

@@ -18,6 +18,7 @@ from adapter.gap.servo_kernels import (
     NO_GROUND,
     PLAY,
     RUBS,
+    STICKS,
     TIGHT,
     WITHIN,
     A,
@@ -36,6 +37,7 @@ EFFECTS = {  # what each is called, its parameter and its unit
     "servo_velocity_gain": ("velocity gain", "kd", "N m s/rad"),
     "servo_delay": ("delay of commands", "d", "s"),
     "coulomb_friction": ("Coulomb friction", "Fc", "N m"),
+    "static_friction": ("static beyond Coulomb friction", "Fs - Fc", "N m"),
     "viscous_friction": ("viscous friction", "Fv", "N m s/rad"),
     "motor_inertia": ("motor inertia (armature)", "B", "kg m2"),
     "servo_torque_limit": ("torque limit", "tau_max", "N m"),
@@ -169,6 +171,8 @@ class Findings:
             self.add("motor_inertia", j, values[3], std[3], float(docs.armature[j]))
         if free[RUBS]:
             self.add("coulomb_friction", j, values[4], std[4], float(docs.coulomb[j]))
+        if free[STICKS]:
+            self.add("static_friction", j, values[STICKS], std[STICKS], float(docs.stiction[j]))
         if free[TIGHT] and values[TIGHT] > 0.0:
             limit, off = 1.0 / values[TIGHT], std[TIGHT] / values[TIGHT] ** 2
             self.add("servo_torque_limit", j, limit, off, float(docs.torque_limit[j]))

@@ -21,7 +21,9 @@ from adapter.model.spatial import Array, matrix_from_quaternion, quaternion_from
 from adapter.model.urdf_text import number_text
 from adapter.model.xml_edit import Element, XmlText
 
-SPEED = "_speed"  # behind a joint's name: the actuator that takes its command's speed
+# behind a joint's name: the actuator that takes its command's speed, and the one that takes from
+# friction, which MuJoCo has as one number, what it loses once the joint slides
+SPEED, SLIDES = "_speed", "_slides"
 STEP_S = 5e-4  # of an arm alone, by Runge and Kutta
 QUICKEST, QUICK_STEP_S = 0.5, 1e-4  # damping over inertia times the step, from which on the second
 FINEST_S = 5e-5  # step for which an actuator still remembers enough of its commands
@@ -31,6 +33,7 @@ PLATE_M = 1.0, 1.0, 0.2  # half the sides of what stands for the ground
 BALL_M = 1e-5  # radius of what touches it
 HARD, HARDER = "0.99 0.99 0.001 0.5 2", 30.0  # MuJoCo's impedance of a contact; than the springs
 QUICK_S, DAMPED = 1e-3, 0.02
+UNEQUAL = 1e-9  # N m/rad, that moves nothing
 
 
 class Floor(NamedTuple):
@@ -58,6 +61,7 @@ class Drives:
         position_gain, velocity_gain: N m/rad, N m s/rad; effort: N m, infinite where unknown.
         feeds_speed: whether the velocity gain acts on the command's speed less the joint's.
         quickness: damping over inertia, 1/s.
+        static: N m, of friction that is gone, in a line, at a speed of `slip`, rad/s.
         delay_s: from a command until it acts; floor: that the arm comes down on, if any.
     """
 
@@ -66,6 +70,8 @@ class Drives:
     effort: Array
     feeds_speed: NDArray[np.bool_]
     quickness: Array
+    static: Array
+    slip: float
     delay_s: float = 0.0
     floor: Floor | None = None
 
@@ -148,7 +154,7 @@ class _Writer:
         """One for each joint's position, in the place of its old one; behind, one for its speed."""
         drives, late, reach = self.drives, self._delay(), self.model.limits
         there = [x for x in self.there if x.parent and x.parent.tag == "actuator"]
-        new, speeds, steered, gone = [], [], list[str](), list[Element]()
+        new, more, steered, gone = [], list[str](), list[str](), list[Element]()
         for k, name in enumerate(self.model.tree.joint_names):
             fed, kv = bool(drives.feeds_speed[k]), float(drives.velocity_gain[k])
             facts = {"name": name, "joint": name, "kp": float(drives.position_gain[k])}
@@ -164,20 +170,29 @@ class _Writer:
             else:
                 new.append(_element("position", facts | late))
                 steered.append(name)
-            for more in old[1:]:
-                self.xml.replace(more, "")
+            for other in old[1:]:
+                self.xml.replace(other, "")
             gone += old[1:]
             speed = {"name": name + SPEED, "joint": name, "kv": kv}
-            speeds += [_element("velocity", speed | late)] if fed else []
+            more += [_element("velocity", speed | late)] if fed else []
+            if drives.static[k] > 0.0:
+                most = float(drives.static[k])
+                eases: dict[str, Any] = {"name": name + SLIDES, "joint": name, "biastype": "affine"}
+                # MuJoCo takes a positive third number for a damping ratio beside equal others
+                eases |= {"gainprm": 0, "biasprm": [0.0, UNEQUAL, most / drives.slip]}
+                more.append(_element("general", eases | {"forcerange": [-most, most]}))
         for number, key in enumerate(x for x in self.there if x.tag == "key"):
             if "ctrl" in key.attributes:  # one number for each actuator
                 told = zip(there, self.compiled.key_ctrl[number], strict=True)
                 values = [float(x) for element, x in told if element not in gone]
                 q, joint = self.compiled.key_qpos[number], self.compiled.joint
                 values += [float(q[joint(name).qposadr[0]]) for name in steered]
-                self.xml.set(key, "ctrl", number_text([*values, *[0.0] * len(speeds)]))
-        self._add("actuator", [*new, *speeds])
-        if speeds:
+                self.xml.set(key, "ctrl", number_text([*values, *[0.0] * len(more)]))
+        self._add("actuator", [*new, *more])
+        if drives.static.any():
+            note = "friction falls with speed by actuators without a control, JOINT"
+            self.notes.append(note + SLIDES)
+        if drives.feeds_speed.any():
             note = "the servos use the command's speed, which MuJoCo does not derive: give it, "
             self.notes.append(f"{note}rad/s, to the actuators JOINT{SPEED}")
 

@@ -1,9 +1,10 @@
-"""Torque limits, dead bands and backlash of position-controlled arms: are they named?
+"""Torque limits, dead bands, backlash, static friction of position-controlled arms: named?
 
     python tests/benchmarks/servo_limit_trials.py KIND [--seeds 12] [--first 0]
 
-KIND is limit, dead or backlash. Each seed is a simulated Panda of `servo_trials.py` with one such
-effect in two joints: a dead band of 2 to 10 mrad, backlash of 2 to 20 mrad, or a torque limit
+KIND is limit, dead, backlash or stiction. Each seed is a simulated Panda of `servo_trials.py` with
+one such effect in two joints: a dead band of 2 to 10 mrad, backlash of 2 to 20 mrad, friction that
+is 1.3 to 2.5 times Coulomb's at rest (an e-th of it left at 0.03 to 0.3 rad/s), or a torque limit
 between what sines ask for in 60 % of time and the most that they ask for. Joints whose limit the
 motion does not reach, which its noise-free asked torque tells, are not counted.
 """
@@ -20,7 +21,12 @@ from adapter.effects.robots import read_robot
 from adapter.gap.servo import explain
 from tests.helpers.position_arm import Drawn, PositionArm, as_log, errors, named, position_arm
 
-EFFECTS = {"limit": "servo_torque_limit", "dead": "servo_dead_band", "backlash": "backlash"}
+EFFECTS = {
+    "limit": "servo_torque_limit",
+    "dead": "servo_dead_band",
+    "backlash": "backlash",
+    "stiction": "static_friction",
+}
 
 
 def asked(arm: PositionArm, seed: int) -> np.ndarray:
@@ -40,12 +46,16 @@ def drawn(kind: str, seed: int) -> tuple[PositionArm, list[int]]:
     if kind == "limit":
         low, high = np.quantile(free := asked(arm, seed), 0.6, axis=0), free.max(axis=0)
         sizes = low + rng.uniform(0.2, 0.8, arm.truth.n) * (high - low)
+    elif kind == "stiction":
+        sizes = arm.servos.coulomb * rng.uniform(0.3, 1.5, arm.truth.n)
     else:
         most = {"dead": -2.0, "backlash": np.log10(0.02)}[kind]
         sizes = 10.0 ** rng.uniform(np.log10(2e-3), most, arm.truth.n)
     values = np.array(getattr(arm.servos, kind))
     values[joints] = sizes[joints]
     changed: dict[str, Any] = {kind: values}
+    if kind == "stiction":
+        changed["slip"] = 10.0 ** rng.uniform(np.log10(0.03), np.log10(0.3), arm.truth.n)
     return replace(arm, servos=replace(arm.servos, **changed)), (joints + 1).tolist()
 
 

@@ -13,7 +13,7 @@ from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import ModelError
 from adapter.gap.servo import explain
-from adapter.gap.servo_kernels import Ground, Load, follow_alone
+from adapter.gap.servo_kernels import SLIP, STICKS, WITHIN, Ground, Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
 from adapter.gap.servo_signals import Track, columns, loads, over_ground
 from adapter.gap.servo_words import headline
@@ -62,6 +62,7 @@ def test_each_is_named_and_an_unseen_motion_foretold(seed: int, drawn: Drawn) ->
     [
         ("servo_dead_band", "dead", (4,), 5e-3),  # rad
         ("servo_torque_limit", "limit", (5,), 1.8),  # N m
+        ("static_friction", "stiction", (3,), 6.0),  # N m
         # rad; gravity holds it on one side
         pytest.param("backlash", "backlash", (4,), 8e-3, marks=pytest.mark.slow),
     ],
@@ -135,8 +136,8 @@ def test_an_arm_that_is_where_its_commands_are_has_nothing_named() -> None:
 
 
 def servo(*numbers: float) -> Array:
-    """(10,) of which the first are told."""
-    return np.pad(np.array(numbers), (0, 10 - len(numbers)))
+    """(11,) of which the first are told."""
+    return np.pad(np.array(numbers), (0, WITHIN + 1 - len(numbers)))
 
 
 def steers(commands: Array) -> Array:
@@ -177,6 +178,21 @@ def test_friction_holds_a_joint() -> None:
     follow_alone(x, steers(np.full(m, 0.05)), load, np.zeros(2), 1e-3, q)
     assert 0.04 - 1e-4 <= q[-1] <= 0.06
     assert np.ptp(q[-100:]) == 0.0
+
+
+def test_friction_falls_as_a_joint_slides() -> None:
+    """Pulled along at a speed, it lags by Coulomb friction and what of the static one is left."""
+    m, step, q = 4000, 1e-3, np.empty(4000)
+    x, load = servo(0.0, 0.0, 0.3, 1e-4, 0.01), Load(*np.zeros((6, m)))
+    x[STICKS] = 0.006
+    follow_alone(x, steers(np.full(m, 0.0159)), load, np.zeros(2), step, q)
+    assert not q.any()
+    for speed in (0.05, 0.1, 0.3):
+        goal = 0.016 + speed * step * (np.arange(m) + 0.5)
+        follow_alone(x, steers(goal), load, np.array([0.0, speed]), step, q)
+        left = 0.006 * max(0.0, 1.0 - speed / SLIP)
+        lag = goal[-1] - q[-1] + 0.5 * speed * step
+        assert abs(lag - (0.3 * speed + 0.01 + left)) < 1e-6, speed
 
 
 def test_a_stop_within_a_step_makes_no_jump() -> None:
@@ -317,7 +333,7 @@ def test_a_servo_file_is_checked(tmp_path: Path, text: str, said: str) -> None:
 def test_a_servo_file_comes_back(tmp_path: Path) -> None:
     servos = position_arm(25).documentation
     ground = Ground(6, np.array([0.0, 0.01, 0.1]), np.array([0.0, 0.0, 1.0]), -0.02, 20.0)
-    limits = {"torque_limit": 9.5, "dead_band": 2e-3, "backlash": 4e-3}
+    limits = {"stiction": 0.2, "torque_limit": 9.5, "dead_band": 2e-3, "backlash": 4e-3}
     servos = replace(servos, ground=ground, **{key: np.array(x) for key, x in limits.items()})
     servos.save(tmp_path / "servo.toml")
     back = read_servos(tmp_path / "servo.toml", servos.joint_names)

@@ -31,17 +31,22 @@ TABLE = 0.55, 2000.0  # m, N/m
 
 
 @pytest.mark.parametrize(
-    ("drawn", "rubs"),
+    ("drawn", "rubs", "static"),
     [
-        (Drawn(noise_rad=5e-5), None),
-        (Drawn(feeds_speed=False, period_s=4e-3, noise_rad=5e-5), None),
-        (Drawn(noise_rad=1e-4, feeds_speed=False), 0.0),
-        (Drawn(noise_rad=1e-4, feeds_speed=False), 0.3),
+        (Drawn(noise_rad=5e-5), None, 0.0),
+        (Drawn(noise_rad=1e-5), None, 0.5),
+        (Drawn(feeds_speed=False, period_s=4e-3, noise_rad=5e-5), None, 0.0),
+        (Drawn(noise_rad=1e-4, feeds_speed=False), 0.0, 0.0),
+        (Drawn(noise_rad=1e-4, feeds_speed=False), 0.3, 0.0),
     ],
 )
-def test_mujoco_alone_moves_as_our_simulation(drawn: Drawn, rubs: float | None) -> None:
-    """Also where the hand comes down on a table of that coefficient of friction."""
+def test_mujoco_alone_moves_as_our_simulation(
+    drawn: Drawn, rubs: float | None, static: float
+) -> None:
+    """Also on a table of a coefficient of friction; with static friction, a share of Coulomb's."""
     arm = position_arm(14, drawn)
+    stiction = static * arm.servos.coulomb
+    arm = replace(arm, servos=replace(arm.servos, stiction=stiction))
     servos = arm.documentation
     if rubs is not None:
         arm = replace(arm, servos=replace(arm.servos, table=(0.0, 0.0, 0.12, *TABLE, rubs)))

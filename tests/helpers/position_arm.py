@@ -40,6 +40,8 @@ class Servos:
         noise_rad: standard deviation of an encoder's reading.
         table: what the hand comes down on: where on the last link (m), its height over the base's
             origin (m), its stiffness (N/m), none where that is zero, and coefficient of friction.
+        stiction: N m, by which breaking loose takes more than Coulomb friction; slip: rad/s, at
+            which an e-th of it is left (Stribeck).
         limit: N m, of what both gains ask for; dead: rad, of an error that drives nothing;
             backlash: rad, of the gear, from end to end; servos steer by their motors, and readings
             are of the links.
@@ -54,6 +56,8 @@ class Servos:
     feeds_speed: bool = True
     noise_rad: float = 2e-5
     table: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    stiction: Array = field(default_factory=lambda: np.zeros(7))
+    slip: Array = field(default_factory=lambda: np.full(7, 0.1))
     limit: Array = field(default_factory=lambda: np.full(7, np.inf))
     dead: Array = field(default_factory=lambda: np.zeros(7))
     backlash: Array = field(default_factory=lambda: np.zeros(7))
@@ -105,9 +109,8 @@ def record(
     every, late = round(period_s / TICK_S), round(servos.delay_s / TICK_S)
     body = Body(truth.frames, truth.theta, truth.base, np.array(servos.table))
     s = servos
-    joints = np.array(
-        [s.kp, s.kd, s.coulomb, s.viscous, s.armature, s.limit, s.dead, s.backlash], float
-    )
+    limits = s.limit, s.dead, s.backlash, s.stiction, s.slip
+    joints = np.array([s.kp, s.kd, s.coulomb, s.viscous, s.armature, *limits], float)
     at, q = np.zeros((5, truth.n)), np.empty_like(commands)
     at[0] = at[3] = commands[0]
     for tick in range(-round(SETTLE_S / TICK_S), len(commands) * every):
@@ -131,13 +134,19 @@ def driven(joints: Array, error: Array, slower: Array) -> Array:
 
 
 @compiled
+def dry_friction(joints: Array, dq: Array) -> Array:
+    """(n,) N m at speeds (n,)."""
+    return joints[2] + joints[8] * np.exp(-((dq / joints[9]) ** 2))
+
+
+@compiled
 def move_with_backlash(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> None:
     """As `move`, each motor behind a gap, whose ends are stiff springs with some damping.
 
     Args:
         at: (5, n) q, dq of the links, ddq (not used), q, dq of the motors, changed.
     """
-    coulomb, viscous, armature, backlash = joints[2], joints[3], joints[4], joints[7]
+    viscous, armature, backlash = joints[3], joints[4], joints[7]
     n, h, still = len(goal), TICK_S / STEPS / 4, np.zeros(len(goal))
     q, dq, _, motor, fast = at
     inertia = mass_matrix(body.frames, body.theta, q)
@@ -147,11 +156,11 @@ def move_with_backlash(body: Body, joints: Array, goal: Array, speed: Array, at:
         into = np.sign(wound) * np.maximum(np.abs(wound) - 0.5 * backlash, 0.0)
         carried = (stiff * into + 0.6 * stiff * h * slip) * (into != 0.0)
         drive = driven(joints, goal - motor, speed - fast) - viscous * fast - carried
-        way = np.sign(fast)
+        way, rubs = np.sign(fast), dry_friction(joints, fast)
         for j in range(n):
-            if way[j] == 0.0 and abs(drive[j]) > coulomb[j]:
+            if way[j] == 0.0 and abs(drive[j]) > rubs[j]:
                 way[j] = np.sign(drive[j])
-        new = fast + h * (drive - way * coulomb) / armature * (way != 0.0)
+        new = fast + h * (drive - way * rubs) / armature * (way != 0.0)
         fast[:] = new * (new * way > 0.0)
         motor += h * fast
         rigid = torques(body.frames, body.theta, body.base, q, dq, still)
@@ -167,11 +176,12 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
     whose velocity would change its sign comes to rest.
 
     Args:
-        joints: (8, n) of `Servos`: kp, kd, coulomb, viscous, armature, limit, dead, backlash.
+        joints: (10, n) of `Servos`: kp, kd, coulomb, viscous, armature, limit, dead, backlash,
+            stiction, slip.
         goal, speed: (n,) rad, rad/s; at: (5, n) q, dq and the last step's ddq, changed, and two
             rows for motors with backlash.
     """
-    coulomb, viscous, armature = joints[2:5]
+    viscous, armature = joints[3:5]
     n, h, still = len(goal), TICK_S / STEPS, np.zeros(len(goal))
     q, dq, last, _, _ = at
     tip = np.eye(4)
@@ -189,17 +199,17 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
             force = body.table[4] * max(body.table[3] - pose[2, 3], 0.0)
             along = J[:2] @ middle
             fast = np.hypot(along[0], along[1])
-            rubs = body.table[5] * force * np.tanh(fast / CREEP_M_S) / max(fast, 1e-9)
-            drive += J[2] * force - rubs * (along @ J[:2])
-        way, rests = np.sign(dq), dq == 0.0
+            drag = body.table[5] * force * np.tanh(fast / CREEP_M_S) / max(fast, 1e-9)
+            drive += J[2] * force - drag * (along @ J[:2])
+        way, rests, rubs = np.sign(dq), dq == 0.0, dry_friction(joints, middle * (dq != 0.0))
         ddq = np.zeros(n)
         for _ in range(2 * n):  # one joint is let go or held at a time
-            A, b = inertia.copy(), drive - way * coulomb
+            A, b = inertia.copy(), drive - way * rubs
             for j in range(n):
                 if rests[j]:
                     A[j, :], A[:, j], A[j, j], b[j] = 0.0, 0.0, 1.0, 0.0
             ddq = np.linalg.solve(A, b)
-            needed = np.abs(drive - inertia @ ddq) - coulomb
+            needed = np.abs(drive - inertia @ ddq) - rubs
             worst, k = 0.0, -1
             for j in range(n):
                 if rests[j] and needed[j] > worst:
@@ -254,6 +264,7 @@ class PositionArm:
         s, n = self.servos, self.truth.n
         numbers = (s.kp, s.kd, s.coulomb, s.viscous, s.armature, np.full(n, s.feeds_speed))
         model = ServoModel(self.truth.joint_names, *numbers, s.delay_s)
+        model = replace(model, stiction=s.stiction)
         return replace(model, torque_limit=s.limit, dead_band=s.dead, backlash=s.backlash)
 
     def true(self, effect: str) -> Array:
@@ -265,6 +276,7 @@ class PositionArm:
             "servo_velocity_gain": s.kd + both,
             "servo_delay": np.full(self.truth.n, s.delay_s),
             "coulomb_friction": s.coulomb,
+            "static_friction": s.stiction,
             "viscous_friction": s.viscous,
             "motor_inertia": s.armature,
             "servo_torque_limit": s.limit,
