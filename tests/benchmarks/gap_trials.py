@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from drivers.files.mcap import Log
-from sim.hidden import Trial, draw
-from sim.hidden.motion import KINDS
-from sim.hidden.record import pybullet_recording, write
 from tests.helpers.benchmark import in_processes, options
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import detectability, torque_judge
 from tests.helpers.gap_scorer import Row, score_trial, summary, table
 from tests.helpers.gap_tools import pinocchio_recording
+from tests.hidden import Trial, draw
+from tests.hidden.motion import KINDS
+from tests.hidden.record import pybullet_recording, write
 
 SIMULATORS: dict[str, Callable[[Trial], Log]] = {
     "pybullet": pybullet_recording,

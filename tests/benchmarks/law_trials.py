@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adapter.gap.workflow import find_gap
-from sim.hidden import Trial, draw, nominal_urdf
-from sim.hidden.record import write_files
 from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_effects import rnea, sense
 from tests.helpers.gap_mujoco import simulate
 from tests.helpers.gap_scorer import wilson
 from tests.helpers.gap_tools import recorded
+from tests.hidden import Trial, draw, nominal_urdf
+from tests.hidden.record import write_files
 
 Array = np.ndarray
 SIZES_NM, WRIST_SHARE = (0.1, 1.0), 0.3  # rms of the law's torque; of joints 5 to 7

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from sim.effects import Effect
-from sim.hidden import Trial, draw
-from sim.hidden.motion import STEP_S, draw_motion
-from sim.hidden.record import write
-from sim.hidden.sizes import COULOMB, draw_bristles, draw_effect, torque_size
 from tests.helpers.benchmark import in_processes, options, told
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_tools import pinocchio_recording
+from tests.hidden import Trial, draw
+from tests.hidden.motion import STEP_S, draw_motion
+from tests.hidden.record import write
+from tests.hidden.sizes import COULOMB, draw_bristles, draw_effect, torque_size
 
 SECONDS, STREAM, SLOW, TURN_S = 40.0, 78, 0.3, 1.0
 SLOW_UNTIL_S, LOAD_S, NEAR_S = (8.0, 15.0), (18.0, 32.0), 0.6

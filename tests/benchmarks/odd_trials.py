@@ -27,10 +27,10 @@ import adapter
 from adapter.effects.robots import read_robot
 from adapter.gap.load import find_load
 from adapter.model.self_model import SelfModel
-from sim.hidden import draw, nominal_urdf
 from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_tools import pinocchio_recording
+from tests.hidden import draw, nominal_urdf
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 STDS, TORQUE_NM, EVERY = 2.0, 0.1, 50

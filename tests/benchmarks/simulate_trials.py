@@ -25,9 +25,9 @@ from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.simulate import SIMULATORS, Rollouts
 from drivers.files.mcap import Log
-from sim.hidden import Trial, draw
 from tests.helpers.benchmark import in_processes, options, told
 from tests.helpers.gap_oracle import second
+from tests.hidden import Trial, draw
 
 
 def true_model(trial: Trial) -> SelfModel:

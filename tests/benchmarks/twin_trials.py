@@ -19,14 +19,14 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from drivers.files.mcap import Log
-from sim.hidden.record import write_files
-from sim.hidden.trial import nominal_urdf
-from sim.hidden.twins import draw_twin
 from sim.truth import Truth
 from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_effects import regressor, rnea
 from tests.helpers.gap_scorer import wilson
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
+from tests.hidden.record import write_files
+from tests.hidden.trial import nominal_urdf
+from tests.hidden.twins import draw_twin
 
 TRUE = {
     "coulomb_friction",

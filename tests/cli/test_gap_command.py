@@ -22,8 +22,8 @@ from adapter.signals.validation import rms_of, validation_error
 from adapter.simulate import SIMULATORS, Rollouts
 from drivers.files.mcap import Log, read_log, write_log
 from sim.effects import Effect
-from sim.hidden import Trial, draw, nominal_urdf, pybullet_recording
 from tests.helpers.gap_tools import believed, pinocchio_recording
+from tests.hidden import Trial, draw, nominal_urdf, pybullet_recording
 
 COULOMB = Effect("coulomb_friction", (4,), {"Fc": 2.0})
 KEYS = {"noise_floor_nm", "before", "after", "findings", "unexplained", "model_out"}

@@ -16,8 +16,8 @@ from adapter.effects.bristle_friction import BristleFriction, StribeckFriction
 from adapter.gap.result import Finding
 from adapter.gap.workflow import find_gap
 from sim.effects import Effect
-from sim.hidden import draw, write
 from tests.helpers.gap_tools import believed, pinocchio_recording
+from tests.hidden import draw, write
 
 
 def named(effect: Effect, seed: int, folder: Path, seconds: float) -> tuple[Finding, ...]:

@@ -14,8 +14,8 @@ from adapter.model.urdf import model_from_urdf
 from adapter.screening.screen import refuse
 from drivers.files.mcap import Log
 from sim.effects import Effect
-from sim.hidden.trial import Trial, draw, nominal_urdf
 from tests.helpers.gap_mujoco import mujoco_recording
+from tests.hidden.trial import Trial, draw, nominal_urdf
 
 SEEDS, PLAY_RAD = (73000, 73001), 8e-3
 BOTH_WAYS_S, MOVES = 0.5, 0.05  # that a joint must move each way, and how fast, rad/s

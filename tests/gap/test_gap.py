@@ -19,11 +19,11 @@ import pytest
 from adapter.gap.workflow import find_gap
 from drivers.files.mcap import Log
 from sim.effects import Effect
-from sim.hidden import Trial, draw, pybullet_recording, write
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import SECOND, detectability, second
 from tests.helpers.gap_scorer import covers, same_joints, score_trial
 from tests.helpers.gap_tools import pinocchio_recording
+from tests.hidden import Trial, draw, pybullet_recording, write
 
 Simulator = Callable[[Trial], Log]
 Z_LEAST, WIDE_RAD = 12.0, 1.2

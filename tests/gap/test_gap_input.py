@@ -14,12 +14,12 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingRefused, Screened, moving_joints, refuse
 from drivers.files.mcap import Log, read_log
 from sim.effects import payload
-from sim.hidden import Trial, draw
-from sim.hidden.record import write
 from tests.benchmarks.live_trials import trial_of
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, pin_model, record, rnea
 from tests.helpers.gap_tools import pinocchio_recording
 from tests.helpers.robot_models import real_log
+from tests.hidden import Trial, draw
+from tests.hidden.record import write
 
 NAMES = panda_model().tree.joint_names
 ORDER = [0, 1, 2, 3, 4, 6, 5]

@@ -21,9 +21,9 @@ from adapter.judgement.priors import theta_prior
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
 from sim.effects import Effect, payload, per_joint
-from sim.hidden.twins import draw_twin
 from tests.helpers.arm_data import Motion, arm, panda_model, record
 from tests.helpers.twin_makers import by_pinocchio
+from tests.hidden.twins import draw_twin
 
 FRICTION = np.array([0.3, 0.4, 0.25, 0.35, 0.2, 0.15, 0.1])
 LOADS_KG = (0.0, 0.6, 1.1, 0.6, 2.4)

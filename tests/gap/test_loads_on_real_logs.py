@@ -21,10 +21,10 @@ from adapter.runs.library import make_log
 from adapter.screening.screen import refuse
 from adapter.screening.timing import lateness
 from drivers.files.mcap import Log
-from sim.hidden.trial import nominal_urdf
 from sim.truth import panda
 from tests.helpers.gap_effects import regressor
 from tests.helpers.robot_models import real_log
+from tests.hidden.trial import nominal_urdf
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "panda_gaz2019"
 pytestmark = pytest.mark.skipif(

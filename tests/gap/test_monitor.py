@@ -19,9 +19,9 @@ from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import StateLayout
 from drivers.files.estimates import EstimateNames
-from sim.hidden.sizes import draw_bristles
 from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
+from tests.hidden.sizes import draw_bristles
 
 AT_S, EARLY_S, SECONDS, CONTACT_S = 15.0, 6.0, 18.0, 1.5
 FORCE_N = np.array([-6.0, 3.0, 7.4])  # 10 N in all

@@ -19,10 +19,10 @@ from adapter.model.urdf import model_from_urdf
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import refuse
 from adapter.screening.timing import lateness
-from sim.hidden.trial import nominal_urdf
-from sim.hidden.twins import Twin, draw_twin
 from tests.helpers.arm_data import panda_model
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
+from tests.hidden.trial import nominal_urdf
+from tests.hidden.twins import Twin, draw_twin
 
 DRY = ("coulomb_friction", "bristle_friction", "stribeck_friction", "asymmetric_friction")
 TWINS = (700, 701, 702, 703, 704, 705, 706, 707, 708, 709)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import can
 
 from sim.damiao.faults import board_faults
-from sim.damiao.line import Line
 from sim.damiao.server import BoardOptions, Boards
 from sim.scenarios import build
+from tests.helpers.can_line import Line
 
 MS_NS = 1_000_000
 IDS = range(1, 8)

@@ -15,7 +15,6 @@ import pinocchio as pin
 
 from drivers.files.mcap import Log
 from sim.effects import Effect
-from sim.hidden import Trial
 from sim.truth import Truth, body_of
 from tests.helpers.gap_effects import (
     Array,
@@ -26,6 +25,7 @@ from tests.helpers.gap_effects import (
     torque_sensor,
 )
 from tests.helpers.gap_tools import recorded
+from tests.hidden import Trial
 
 H_S, SUBSTEPS = 0.5e-3, 2
 STIFF, DAMP = 900.0, 60.0  # 1/s2 and 1/s, feedback of the controller

@@ -20,13 +20,13 @@ from scipy.signal import fftconvolve, firwin
 from adapter.model.model_file import load_model
 from drivers.files.mcap import Log
 from sim.effects import Effect
-from sim.hidden import Trial
-from sim.hidden.motion import draw_motion
 from sim.truth import Truth
 from tests.helpers.arm_data import rms
 from tests.helpers.gap_effects import Array, effect_from, predict, regressor, rnea, sense, slope
 from tests.helpers.gap_scorer import Row
 from tests.helpers.gap_tools import pinocchio_recording, sensor_noise
+from tests.hidden import Trial
+from tests.hidden.motion import draw_motion
 
 TAPS, EDGE, STEP = 1001, 500, 40  # at 1 kHz: transition of 3 Hz; half a filter; to 25 Hz
 LOWPASS = firwin(TAPS, 10.0, fs=1000.0)[:, None]

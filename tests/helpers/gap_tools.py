@@ -1,7 +1,7 @@
 """Hidden-effect trials without a simulator: the drawn motion, Pinocchio's torque, noise.
 
 No controller and no steps in time, so that a trial of 20 s takes a fraction of a second. The
-arm does exactly what it was told; everything else is as in `sim.hidden`.
+arm does exactly what it was told; everything else is as in `tests.hidden`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 from scipy.signal import butter, sosfilt
 
 from drivers.files.mcap import Log
-from sim.hidden import Trial, draw
-from sim.hidden.motion import DrawnMotion, draw_motion
-from sim.hidden.record import log_of
-from sim.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
-from sim.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM
 from sim.noise_levels import NoiseLevels
 from sim.truth import panda, wrong_bodies
 from tests.helpers.gap_effects import Array, sense
+from tests.hidden import Trial, draw
+from tests.hidden.motion import DrawnMotion, draw_motion
+from tests.hidden.record import log_of
+from tests.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
+from tests.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM
 
 NOISE_STREAM = 1 << 35
 

@@ -20,13 +20,13 @@ from drivers.fci.codec import ReplyParser, State, StateDecoder
 from drivers.fci.connect import Channel
 from drivers.fci.torque_control import TorqueControl
 from drivers.interface import Driver, DriverError, Intake, JointSample, PassedOn
-from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.fci.codec import RequestReader, read_command
 from sim.fci.robot import Reporter, Robot
 from sim.joint_effects import Obstacles
 from sim.plant import SimulatedArm
 from sim.scenarios import Scenario
+from tests.helpers.can_line import Line
 
 VERSION = 5
 

@@ -20,8 +20,8 @@ from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_result import EFFECTS, ServoGap
 from drivers.files.mcap import Commands, Log, McapWriter
 from sim.dynamics import Frames, compiled, end_effector, mass_matrix, torques
-from sim.hidden.motion import draw_motion
 from sim.truth import Array, Truth, documented
+from tests.hidden.motion import draw_motion
 
 TICK_S, STEPS = 1e-3, 8  # commands act at ticks; steps of a tick
 CREEP_M_S = 2e-3  # of a hand that friction on the table holds

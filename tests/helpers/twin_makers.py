@@ -1,4 +1,4 @@
-"""Recordings of `sim.hidden.twins`: Pinocchio's torques along the motion, or MuJoCo's motion."""
+"""Recordings of `tests.hidden.twins`: Pinocchio's torques along the motion, or MuJoCo's motion."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 
 from drivers.files.mcap import Log
-from sim.hidden.twins import STEP_S, Twin, recorded
 from tests.helpers.gap_effects import rnea
 from tests.helpers.gap_mujoco import mjcf
+from tests.hidden.twins import STEP_S, Twin, recorded
 
 STIFF, DAMP, SLOW = 3600.0, 120.0, 6.0  # 1/s2, 1/s and 1/s of the controller
 SUBSTEPS = 4

@@ -23,11 +23,11 @@ from adapter.runs.outcome import Outcome, learned_model
 from adapter.runs.pipeline import make_learner
 from adapter.runs.replay import fitted_to, replay
 from drivers.files.mcap import Log, read_log
-from sim.hidden.record import write_files
-from sim.hidden.trial import nominal_urdf
-from sim.hidden.twins import draw_twin
 from tests.helpers.arm_data import panda_model
 from tests.helpers.twin_makers import by_pinocchio
+from tests.hidden.record import write_files
+from tests.hidden.trial import nominal_urdf
+from tests.hidden.twins import draw_twin
 
 Numbers = dict[tuple[str, int], tuple[float, float]]
 SEED = 6200

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim.damiao.line import frame_ns
 from sim.engine import Engine
 from sim.scenarios import build
 from tests.helpers.board_tools import (
@@ -19,6 +18,7 @@ from tests.helpers.board_tools import (
     parse,
     rig,
 )
+from tests.helpers.can_line import frame_ns
 
 READY = build("nominal").truth.ready
 OPENARM = ((12.5, 45.0, 54.0),) * 2 + ((12.5, 10.0, 28.0),) * 2 + ((12.5, 30.0, 10.0),) * 3

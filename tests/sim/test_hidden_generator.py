@@ -16,11 +16,6 @@ from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.urdf import read_urdf
 from drivers.files.mcap import Commands, read_log
-from sim.hidden import SHARES, draw, motion
-from sim.hidden.record import pybullet_recording, simulate, write
-from sim.hidden.sizes import CATALOGUE, OUTSIDE, WIDER, WRIST, WRIST_SHARE, draw_effect
-from sim.hidden.trial import FRICTION_SHARE, MODEL_ERROR, RUBS
-from sim.hidden.twins import STEP_S, draw_twin
 from tests.benchmarks.gap_trials import run_trial
 from tests.helpers import gap_mujoco
 from tests.helpers.gap_effects import predict, rnea, sense, slope
@@ -28,6 +23,11 @@ from tests.helpers.gap_oracle import Oracle, detectability, rms, second, slow, t
 from tests.helpers.gap_scorer import score_trial, summary, table, wilson
 from tests.helpers.gap_tools import pinocchio_recording, with_sines
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
+from tests.hidden import SHARES, draw, motion
+from tests.hidden.record import pybullet_recording, simulate, write
+from tests.hidden.sizes import CATALOGUE, OUTSIDE, WIDER, WRIST, WRIST_SHARE, draw_effect
+from tests.hidden.trial import FRICTION_SHARE, MODEL_ERROR, RUBS
+from tests.hidden.twins import STEP_S, draw_twin
 
 SEEDS = range(150)
 RANGES = {  # that a search believes in

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from drivers.files.mcap import Commands, Log, write_log
 from drivers.interface import JointSample
-from sim.hidden.trial import Trial, nominal_urdf
 from sim.noise import SensorNoise, levels_of
 from sim.plant import PERIOD_NS, Plant
 from sim.truth import Array
+from tests.hidden.trial import Trial, nominal_urdf
 
 RATE_S = 35.0  # 1/s, the double pole of the feedback
 INTEGRAL_S = 8.0  # 1/s, pole of the slow part that carries friction and payloads

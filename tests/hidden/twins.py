@@ -16,12 +16,19 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from drivers.files.mcap import Log
-from sim.hidden.motion import MARGIN_RAD, hand, points
-from sim.hidden.record import log_of
-from sim.hidden.sizes import Bristles, box_moments, draw_bristles, log_uniform, sizes, wrist_shares
-from sim.hidden.trial import first_order
 from sim.noise import levels_of
 from sim.truth import FLANGE_M, Array, Truth, panda, theta_of, wrong_body
+from tests.hidden.motion import MARGIN_RAD, hand, points
+from tests.hidden.record import log_of
+from tests.hidden.sizes import (
+    Bristles,
+    box_moments,
+    draw_bristles,
+    log_uniform,
+    sizes,
+    wrist_shares,
+)
+from tests.hidden.trial import first_order
 
 STREAM, NOISE_STREAM = 36, 37  # apart from those of the other trials
 STEP_S = 1e-3  # of the motion that is recorded

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sim.hidden.record import pybullet_recording, simulate, write, write_files
-from sim.hidden.trial import KINDS, SHARES, Trial, draw, nominal_urdf
+from tests.hidden.record import pybullet_recording, simulate, write, write_files
+from tests.hidden.trial import KINDS, SHARES, Trial, draw, nominal_urdf
 
 __all__ = [
     "KINDS",

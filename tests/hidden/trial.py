@@ -15,8 +15,12 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sim.effects import Effect
-from sim.hidden.motion import DrawnMotion, draw_motion
-from sim.hidden.sizes import (
+from sim.noise import levels_of
+from sim.noise_levels import NoiseLevels
+from sim.truth import ATTEMPTS, Array, Truth, panda, wrong_bodies
+from sim.urdf_writer import urdf
+from tests.hidden.motion import DrawnMotion, draw_motion
+from tests.hidden.sizes import (
     CATALOGUE,
     COULOMB,
     OUTSIDE,
@@ -28,10 +32,6 @@ from sim.hidden.sizes import (
     torque_size,
     wrist_shares,
 )
-from sim.noise import levels_of
-from sim.noise_levels import NoiseLevels
-from sim.truth import ATTEMPTS, Array, Truth, panda, wrong_bodies
-from sim.urdf_writer import urdf
 
 KINDS = ("null", "single", "pair", "outside")
 SHARES = (0.25, 0.40, 0.25, 0.10)
