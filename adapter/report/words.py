@@ -23,6 +23,12 @@ REFUSALS = {
     "filter_settling": "the filter was still settling after a start or a gap",
     "at_rest": "the arm was at rest, which teaches nothing",
     "torque_saturated": "a torque was at its limit",
+    "implausible_step": "a reading was further from the one before than a joint moves",
+    "stuck_joint": "a joint's angle stood still while the arm moved",
+    "encoder_jump": "after a joint's angle had jumped nothing more is learned",
+    "time_ahead": "its stamp was far ahead of the one before",
+    "base_unheard": "nothing was heard of the base's motion",
+    "between": "of several within a millisecond, not the one that is used",
 }
 
 

@@ -25,12 +25,14 @@ from adapter.report.learned_panels import bodies_over_time, rotation_path
 from adapter.report.next_steps import _again, next_steps
 from adapter.report.style import thin
 from adapter.report.trust import headline
+from adapter.report.words import REFUSALS
 from adapter.report.worth import SLOW, Worth, slow_share, torque_fall, truth_tables
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
 from adapter.runs.pipeline import Pipeline
 from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data, save_run
 from adapter.runs.score import Course, figures, reference_from
+from adapter.signals.checks import Verdict
 from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.browser import ids_of_a_whole_page, laid_out, shown_without_complaint, text_of
@@ -261,6 +263,10 @@ def test_a_documented_low_pass_goes_by_the_stamps_of_the_rows(data: RunData) -> 
     before, without = (torque_fall(x).before for x in (late, data))
     assert (np.abs(before - without) > 1e-6).all()
     assert (before < 1.2 * without + 0.02).all()
+
+
+def test_every_reason_has_its_words():
+    assert {verdict.name.lower() for verdict in Verdict} == {"good", *REFUSALS}
 
 
 def test_late_ticks_of_our_own_are_told_from_the_machine_s(data: RunData) -> None:
