@@ -20,6 +20,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, frame_errors
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.signals.front_end import FrontEnd
+from adapter.signals.records import stamp_of
 from drivers.faults.driver import FaultyDriver, with_faults
 from drivers.files.log import LogArm
 from drivers.files.mcap import write_log
@@ -37,12 +38,14 @@ class Watched:
     def __init__(self, learner: OnlineLearner) -> None:
         self.learner, self.finite = learner, True
         self.history: list[np.ndarray] = []
+        self.stamps_ms: list[int] = []
 
     def step(self, state) -> None:
         assert np.isfinite(state[2:30]).all(), "a state that is no number reached the learner"
         self.learner.step(state)
         theta = self.learner.theta.theta
         self.history.append(theta.copy())
+        self.stamps_ms.append(stamp_of(state) // 1_000_000)
         schema = self.learner.schema
         known = theta, schema.R0, schema.p, self.learner.theta.effect_values
         self.finite = self.finite and all(np.isfinite(x).all() for x in known)
@@ -50,15 +53,14 @@ class Watched:
 
 @dataclass(frozen=True)
 class FaultRun:
-    """What a run came to; `history` is θ (7, 10) after each state learned from."""
+    """What a run came to; θ (7, 10) after each state learned from, and the stamps of these."""
 
     text: str
     driver: FaultyDriver
     front_end: FrontEnd
     learner: OnlineLearner
     result: Session
-    finite: bool
-    history: list[np.ndarray]
+    watched: Watched
 
     @property
     def refused(self) -> dict[str, int]:
@@ -87,7 +89,7 @@ def _run(
         result = run_lockstep(driver, front_end, watched, controller, seconds)
     finally:
         driver.close()
-    return FaultRun(text, driver, front_end, learner, result, watched.finite, watched.history)
+    return FaultRun(text, driver, front_end, learner, result, watched)
 
 
 def run_faulty(text: str, seconds: float) -> FaultRun:
@@ -126,7 +128,6 @@ class Difference:
         torque: rms of the same for torques (m, n) that the two predict on held-out motion.
         rotation_rad, position_m: of λ, in its observable directions, largest over the links.
         error_ratio: torque error of b on held-out motion over that of a.
-        torque_nm: rms of the difference of the predicted torques.
     """
 
     theta: float
@@ -134,14 +135,6 @@ class Difference:
     rotation_rad: float
     position_m: float
     error_ratio: float
-    torque_nm: float
-
-    def __str__(self) -> str:
-        return (
-            f"theta {self.theta:.2f} std, torque {self.torque:.2f} std ({self.torque_nm:.4f} N m), "
-            f"lambda {self.rotation_rad:.1e} rad {self.position_m:.1e} m, "
-            f"error x {self.error_ratio:.2f}"
-        )
 
 
 @cache
@@ -172,5 +165,4 @@ def difference(a: OnlineLearner, b: OnlineLearner) -> Difference:
         rotation_rad=float(rotation.max()),
         position_m=float(position.max()),
         error_ratio=float(errors[1] / errors[0]),
-        torque_nm=float(np.sqrt(np.mean(torque**2))),
     )
