@@ -303,7 +303,7 @@ class Beside:
         sources: tuple[SnapshotReader | None, LoopBoard | None],
         joint_names: tuple[str, ...],
     ) -> None:
-        self._writer, self._job = writer, job
+        self._writer = writer
         self._reader, self._board = sources
         names = estimate_names(joint_names, self._reader, job.arm)
         self._messages = RunMessages(names, job.arm)

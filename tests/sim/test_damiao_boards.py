@@ -357,24 +357,6 @@ def test_in_one_process_on_the_virtual_bus() -> None:
         host.shutdown()
 
 
-def test_an_eager_line_brings_what_is_under_way_and_else_no_time_passes() -> None:
-    with rig() as bench:
-        bench.send(0x7FF, refresh(1))
-        assert bench.line.host.recv(0.0) is None
-        assert bench.line.now_ns() == bench.line.start_ns
-        with bench.line.eager():
-            assert bench.line.host.recv(0.0).arbitration_id == 0x11
-            after = bench.line.now_ns()
-            assert bench.line.host.recv(0.0) is None
-        assert bench.line.now_ns() == after < bench.line.start_ns + MS_NS
-        assert bench.line.next_whole_ns(MS_NS) == bench.line.start_ns + MS_NS
-        bench.send(0x7FF, refresh(2))
-        assert bench.line.host.recv(0.5).arbitration_id == 0x12  # lets time pass until then
-        begun = bench.line.now_ns()
-        assert bench.line.host.recv(0.5) is None
-        assert bench.line.now_ns() == begun + 500 * MS_NS
-
-
 def receive(bus: can.BusABC, identifier: int, patience_s: float = 20.0) -> can.Message | None:
     end = time.monotonic() + patience_s
     while (left_s := end - time.monotonic()) > 0:
