@@ -67,10 +67,11 @@ NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
 HAND_ROWS = 500  # of a recording, where the way of the hand is told
 ROUGH_STEP_S = 8e-3  # of the first simulations
-STATIC_SHARE = 0.3  # of Coulomb friction, at which static friction is first tried
+STATIC_START = 0.3  # of Coulomb friction, at which static friction is first tried
 # what a limit, a dead band or backlash has to tell of blocks not seen, and its share of what was
 # left: simulated ones explain nearly all of it, on a real arm a wrong one explained a tenth
 LIMITED_CHI2, LIMITED_SHARE = 12.0, 0.25
+STATIC_SHARE = 0.03  # of static friction: 0.05 to 0.4 where there is some, 0.005 beside a dead band
 # for so long, in so many recordings (one, where the hand's tip is documented): its place is known
 TOUCHED_S, LEAST_TOUCHED = 1.0, 2
 
@@ -255,7 +256,7 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
         tasks = replace(arm, tracks=tracks).tasks(motions)
     if arm.documented.is_ideal:
         arm = replace(arm, usual=float(np.median(x[:, A])))
-    x[:, STICKS] = STATIC_SHARE * x[:, RUBS]
+    x[:, STICKS] = STATIC_START * x[:, RUBS]
     fits = [
         fit_joint(replace(task, usual=arm.usual), fit.freedom.beside(STICKS), own)
         for task, fit, own in zip(tasks, fits, x, strict=True)
@@ -282,24 +283,25 @@ def _limited(fit: JointFit, noise: float) -> JointFit:
             start = min(starts, key=lambda x: misfit(fit.task.fitted(x)))
             fits.append(fit_joint(fit.task, freedom, start))
         best = min(fits, key=JointFit.error, default=fit)
-        if not _explains(best, fit):
+        if not _explains(best, fit, LIMITED_SHARE):
             break
         fit = _needed(best, fit.freedom.free)  # what stood in for what is there now goes
     return fit
 
 
 def _needed(fit: JointFit, asked: NDArray[np.bool_]) -> JointFit:
-    """A fit without those limits asked for, (11,), that explain too little beside the rest."""
-    for k in range(TIGHT, WITHIN):
+    """A fit without those extras asked for, (11,), that explain too little beside the rest."""
+    for k in range(STICKS, WITHIN):
         if asked[k] and fit.freedom.free[k]:
             without = fit_joint(fit.task, fit.freedom.without(k), fit.x)
-            fit = fit if _explains(fit, without) else without
+            share = STATIC_SHARE if k == STICKS else LIMITED_SHARE
+            fit = fit if _explains(fit, without, share) else without
     return fit
 
 
-def _explains(fit: JointFit, without: JointFit) -> bool:
-    """Whether what a fit has and another has not explains enough of what that one leaves."""
-    least = max(LIMITED_CHI2 * fit.unit, LIMITED_SHARE * without.error())
+def _explains(fit: JointFit, without: JointFit, share: float) -> bool:
+    """Whether what a fit has and another has not explains a share of what that one leaves."""
+    least = max(LIMITED_CHI2 * fit.unit, share * without.error())
     return without.error() - fit.error() > least and _paid(fit, without) > LIMITED_CHI2
 
 
@@ -314,7 +316,7 @@ def _named(arm: _Arm, fits: list[JointFit], progress: Callable[[str], None]) -> 
     for _ in range(ROUNDS):
         tasks = arm.tasks(_motions(arm, fits))
         fits = [fit_joint(t, f.freedom, f.x) for t, f in zip(tasks, fits, strict=True)]
-    # what a limit explained on long steps, and under noisy loads, may be explained by now
+    # what one explained on long steps, and under noisy loads, may be explained by now
     fits = _with_lead(arm, [_needed(fit, fit.freedom.free) for fit in fits])
     fits = _with_one_delay(arm, fits)
     tasks = arm.tasks(_motions(arm, fits))
