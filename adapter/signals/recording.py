@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -98,8 +97,10 @@ def _read(path: Path, topic: str | None) -> mcap.Log:
     except DriverError as error:
         trouble = error
     if log is None or not (log.is_mapped or np.any(np.nan_to_num(log.tau))):
-        with suppress(DriverError):  # the first one says what is wrong
+        try:
             log = mcap.read_position_log(path, topic) or log
+        except DriverError as error:  # it found commands, and knows more of what is wrong
+            trouble = error
     if log is None:
         assert trouble is not None
         raise trouble

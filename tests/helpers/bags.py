@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat
+from rosbags.rosbag2 import CompressionFormat, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -25,6 +25,10 @@ DEFINITIONS = {
     "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values\n",
     "control_msgs/msg/DynamicJointState": (
         "std_msgs/Header header\nstring[] joint_names\nInterfaceValue[] interface_values\n"
+    ),
+    "control_msgs/msg/JointJog": (
+        "std_msgs/Header header\nstring[] joint_names\nfloat64[] displacements\n"
+        "float64[] velocities\nfloat64 duration\n"
     ),
     "franka_msgs/msg/CollisionIndicators": f"{_COLLISION}float64[7] e\nfloat64[7] f\n",
     "franka_msgs/msg/FrankaRobotState": _ROBOT_STATE,
@@ -97,6 +101,8 @@ def message(store, kind, names, motion, i):
         ]
         sensor = value(["force.x"], np.array([1.0 * i]))
         return make(header, ["wrist_sensor", *names], [sensor, *rows])
+    if kind == "control_msgs/msg/JointJog":
+        return make(header, list(names), np.zeros(0), dq, 0.1)
     if kind == "franka_msgs/msg/FrankaRobotState":
         corner = store.types["geometry_msgs/msg/Vector3"](i, 0.0, 0.0)
         flags = store.types["franka_msgs/msg/CollisionIndicators"](*[corner] * 4, filler, filler)
@@ -154,3 +160,36 @@ def _fill(writer, store, topics, names, serialize):
         for i, stamp_ns in enumerate(motion.stamp_ns):
             raw = serialize(message(store, kind, names, motion, i), kind)
             writer.write(connection, int(stamp_ns), raw)
+
+
+def write_controller_states(path, points, motion, commands, topics=("/arm/state",)):
+    """A bag with the states of controllers of trajectories, whose points have these names.
+
+    The first one holds `commands`, the second one the motion with its efforts where they are
+    numbers; the path's ending says the kind of bag. References have accelerations every third time,
+    and come ever later.
+    """
+    ros1, kind = path.suffix == ".bag", "control_msgs/msg/JointTrajectoryControllerState"
+    fields = "".join(f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in points)
+    text = f"std_msgs/Header header\nstring[] joint_names\n{fields}"
+    old = Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE
+    store = _store(old, {kind: text})
+    point = store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    after = store.types["builtin_interfaces/msg/Duration"]
+    storage = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    writer = Ros1Writer(path) if ros1 else Ros2Writer(path, version=9, storage_plugin=storage)
+    serialize, none = store.serialize_ros1 if ros1 else store.serialize_cdr, np.zeros(0)
+    with writer:
+        connections = [writer.add_connection(x, kind, typestore=store) for x in topics]
+        for i, stamp_ns in enumerate(motion.stamp_ns):
+            stamp = store.types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), 10**9))
+            header = {"seq": i} if ros1 else {}
+            header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **header)
+            q, dq, tau = motion.q[i], motion.dq[i], motion.tau[i]
+            told = [point(commands[i], dq, none if i % 3 else dq, none, after(i, 7 * i))]
+            told.append(point(q, dq, none, none if np.isnan(tau).all() else tau, after(0, 0)))
+            told += [point(none, none, none, none, after(0, 0))] * (len(points) - 2)
+            raw = serialize(store.types[kind](header, list(JOINTS), *told), kind)
+            for connection in connections:
+                writer.write(connection, int(stamp_ns), raw)
+    return path

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
 from drivers.files.mcap import McapWriter, read_log, read_position_log
-from tests.helpers.bags import Motion, write_ros2
+from tests.helpers.bags import JOINTS, Motion, write_controller_states, write_ros2
 
 TIME = np.arange(500) * 0.02
 Q = 0.5 * np.sin(2.0 * TIME[:, None] + [0.0, 1.0])
@@ -186,3 +187,50 @@ def test_texts_and_blanks_that_nobody_asked_for(tmp_path, capsys):
     with pytest.raises(SystemExit):
         refusal(capsys, path, "--rate", "0")
     assert "no rate in Hz" in capsys.readouterr().err
+
+
+def silent():
+    motion = Motion.of(samples=200)
+    return replace(motion, tau=np.full_like(motion.tau, np.nan))
+
+
+NEW = ("reference", "feedback", "error", "output")
+OLD = ("desired", "actual", "error")
+
+
+@pytest.mark.parametrize("points", [NEW, OLD, (*NEW, "desired", "actual")])
+@pytest.mark.parametrize("name", ["sqlite", "a.mcap", "a.bag"])
+def test_the_state_of_a_controller_is_commands_and_positions(tmp_path, capsys, points, name):
+    motion = silent()
+    commands = np.add(motion.q, [0.03, -0.05, 0.01])
+    bag = write_controller_states(tmp_path / name, points, motion, commands)
+    log = read_position_log(bag)
+    assert log.joint_names == JOINTS and np.array_equal(log.stamp_ns, motion.stamp_ns)
+    assert_commanded(log, motion.q, commands, 1e-9 * motion.stamp_ns)
+    assert_commanded(imported(tmp_path, bag), motion.q, commands, 1e-9 * motion.stamp_ns)
+    said = capsys.readouterr().err
+    assert "positions and commands are feedback and reference of /arm/state" in said
+    assert main(["info", str(bag)]) == 0
+    said = capsys.readouterr().out
+    assert "200 commanded positions" in said and "rms: 30  50  10 mrad" in said
+
+
+def test_which_topics_tell_commands(tmp_path, capsys):
+    motion = silent()
+    orders = replace(motion, q=motion.q + 0.1)
+    dynamic, jog = "control_msgs/msg/DynamicJointState", "control_msgs/msg/JointJog"
+    topics = {"/dynamic_joint_states": (dynamic, motion), "/servo/delta": (jog, motion)}
+    told = write_ros2(tmp_path / "a", {**topics, "/joint_commands": (dynamic, orders)})
+    assert_commanded(imported(tmp_path, told), motion.q, orders.q, 1e-9 * motion.stamp_ns)
+    said = capsys.readouterr().err
+    assert "those of /dynamic_joint_states" in said and "/servo/delta jogs: steps and" in said
+    alone = write_ros2(tmp_path / "b", topics)
+    assert "efforts that are not a number" in refusal(capsys, alone)
+    assert main(["info", str(alone)]) == 0 and "/servo/delta jogs" in capsys.readouterr().out
+    two = write_controller_states(tmp_path / "c", NEW, motion, orders.q, ("/left", "/right"))
+    assert "2 topics tell positions and commands: /left, /right; choose" in refusal(capsys, two)
+    assert main(["info", str(two)]) == 0 and "/left, /right; choose" in capsys.readouterr().out
+    assert_commanded(read_position_log(two, "/right"), motion.q, orders.q, 1e-9 * motion.stamp_ns)
+    torques = replace(motion, tau=motion.q)
+    strong = write_controller_states(tmp_path / "d", OLD, torques, orders.q)
+    assert read_position_log(strong) is None and np.array_equal(read_log(strong).tau, motion.q)
