@@ -95,7 +95,39 @@ def test_a_data_set_there_and_back(tmp_path, capsys):
     info = json.loads((tmp_path / "one" / "meta" / "info.json").read_text())
     assert (info["fps"], info["total_frames"]) == (50, len(TIME))
     assert set(info["features"]) == set(first.column_names)
+    told = json.loads((tmp_path / "one" / "meta" / "stats.json").read_text())
+    episode = pq.read_table(tmp_path / "one" / "meta" / "episodes").to_pylist()[0]
+    for name, numbers in told.items():
+        values = np.array(first[name].to_pylist()).reshape(len(TIME), -1)
+        shares = {f"q{x:02}": np.quantile(values, x / 100, axis=0) for x in (1, 10, 50, 90, 99)}
+        shares |= {x: getattr(np, x)(values, axis=0) for x in ("min", "max", "mean", "std")}
+        assert numbers.keys() == {*shares, "count"} and numbers["count"] == [len(TIME)]
+        for key, x in shares.items():
+            assert np.allclose(numbers[key], x, atol=1e-6)
+            assert episode[f"stats/{name}/{key}"] == numbers[key]
     assert main(["export", str(tmp_path / "out.mcap"), *out]) == ExitCode.WRONG_USE
+
+
+def test_what_lerobot_itself_reads_and_appends_to(tmp_path):
+    reason = "the package lerobot is not installed"
+    loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason=reason).LeRobotDataset
+    states = table(tmp_path / "s.csv", TIME, Q, CMD, header="t;q_1;q_2;cmd_1;cmd_2")
+    imported(tmp_path, states)
+    folder = tmp_path / "set"
+    assert main(["export", str(tmp_path / "out.mcap"), "--lerobot", str(folder)]) == 0
+    read = loader("nobody/set", root=folder)
+    rows = [read[i] for i in range(len(read))]
+    for name, values in (("observation.state", Q), ("action", CMD), ("timestamp", TIME)):
+        assert np.allclose([row[name].numpy() for row in rows], values, atol=1e-6)
+    assert (read.fps, rows[-1]["task"]) == (50, "motion")
+    for k in range(30):
+        row = {"observation.state": Q[k], "action": CMD[k]}
+        read.add_frame({**{x: v.astype(np.float32) for x, v in row.items()}, "task": "more"})
+    read.save_episode()
+    read.finalize()
+    again = loader("nobody/set", root=folder)
+    assert (again.num_episodes, len(again), again[len(TIME)]["task"]) == (2, len(TIME) + 30, "more")
+    assert_commanded(imported(tmp_path, folder, "--episode", "1"), Q[:30], CMD[:30], TIME[:30])
 
 
 def sage(folder, joints):
