@@ -6,10 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adapter.model.locking import locked
+from adapter.model.locking import FOLLOWS, locked
 from adapter.model.self_model import SelfModel
 from drivers.files.mcap import IN_MEMORY, Log
 from drivers.interface import DriverError
+
+# What a joint may be off the one that it follows: play, in rad or m, and a share of its motion
+FOLLOWED, FOLLOWED_SHARE = 1e-3, 0.1
 
 
 def present(
@@ -27,7 +30,10 @@ def present(
     Returns:
         The robot, and a sentence where joints were locked.
     """
-    still = [frame.joint for frame in documented.frames if frame.joint in names]
+    followers = documented.provenance.get(FOLLOWS, {})  # `matching` checks those with their leader
+    checked = [name for name, (leader, *_) in followers.items() if leader in names]
+    held = [frame.joint for frame in documented.frames if frame.joint in names]
+    still = [name for name in held if name not in checked]
     how = "holds still (--joints A,B,... with them among these learns them)"
     idle = [f"{source}: has {', '.join(still)}, which {documented.name} {how}"] if still else []
     absent = [name for name in documented.tree.joint_names if name not in names]
@@ -98,9 +104,27 @@ def matching(log: Log, documented: SelfModel) -> Log:
             f"{log.path}: motion of not all links was recorded (twists and accelerations of "
             f"{', '.join(tree.link_names)}); link motion is synthesized instead"
         )
+    more += _strayed(log, documented)
     log = log.select([name for name in joints if name], [name for name in links if name and heard])
     log.warnings.extend(warnings + more)
     return log
+
+
+def _strayed(log: Log, documented: SelfModel) -> list[str]:
+    """Sentences on recorded joints that do not follow others as the robot's file says."""
+    found = []
+    for name, (leader, factor, offset, unit) in documented.provenance.get(FOLLOWS, {}).items():
+        if not {name, leader} <= {*log.joint_names}:
+            continue
+        own, led = (
+            np.concatenate([part.q[:, log.joint_names.index(x)] for part in log.spread()])
+            for x in (name, leader)
+        )
+        off = float(np.sqrt(np.nanmean((own - factor * led - offset) ** 2)))
+        if off > max(FOLLOWED, FOLLOWED_SHARE * float(np.nanstd(own))):
+            said = f"{factor:g} times {leader} plus {offset:g}, as {documented.name} has it"
+            found.append(f"{log.path}: {name} is {off:.3g} {unit} (rms) off {said}")
+    return found
 
 
 def corresponding(
