@@ -210,6 +210,18 @@ def test_headers_that_say_their_units(tmp_path, code, point):
         assert np.array_equal(log.stamp_ns, np.round(TIME * 1e9))
 
 
+def test_a_rail_beside_joints_that_turn(tmp_path, capsys):
+    header = "t;E1 pos [mm];A1 pos [deg];E1 vel [mm/s];A1 vel [deg/s];E1 torque [N];A1 torque [Nm]"
+    rail, turn = Q.T
+    columns = (TIME, 1e3 * rail, np.degrees(turn), 1e3 * TAU[:, 0], np.degrees(TAU[:, 1]))
+    log = imported(tmp_path, table(tmp_path / "a.csv", *columns, TAU, header=header))
+    for told, said in ((log.q, Q), (log.dq, TAU), (log.tau, TAU)):
+        assert np.allclose(told, said)
+    bare = header.replace(" [mm/s]", "").replace(" [deg/s]", "")
+    table(tmp_path / "a.csv", *columns[:3], *columns[1:3], TAU, header=bare)
+    assert np.allclose(imported(tmp_path, tmp_path / "a.csv").dq, Q)
+
+
 def test_texts_and_blanks_that_nobody_asked_for(tmp_path, capsys):
     words, where = np.full(len(TIME), "ok"), ("--columns", "q=1:3,tau=3:5")
     path = table(tmp_path / "a.csv", words, Q, TAU, np.full(len(TIME), ""))

@@ -97,7 +97,7 @@ def test_units(tmp_path, capsys):
     as_it_is = imported(bag, "--units", "q=rad,dq=deg", "--overwrite")
     assert np.array_equal(read_log(as_it_is).q, told.q)
     assert np.allclose(read_log(as_it_is).dq, 5 * MOTION.dq, rtol=1e-14)
-    said = "no unit 'grad' for q; have: rad, deg; did you mean rad?"
+    said = "no unit 'grad' for q; have: rad, deg, m, mm; did you mean rad?"
     assert said in refused(capsys, bag, "--units", "q=grad")
     assert main(["info", str(bag), "--units", "q=deg"]) == 0
     assert "positions rad" in capsys.readouterr().out
