@@ -95,14 +95,10 @@ class Tree:
         return tuple(reversed(path))
 
     def unit(self, turning: str, sliding: str, joint: int | None = None) -> str:
-        """A unit of a joint (from 0), or of all: `N m`, or `N m (N of joint 1)` where that slides.
-
-        Args:
-            turning, sliding: what it is of joints that turn, and that slide.
-        """
-        own = [str(j + 1) for j, slides in enumerate(self.slides) if slides]
+        """The unit of a joint (from 0), or of all: `N m (N of joint 1)` where the first slides."""
         if joint is not None:
             return sliding if self.slides[joint] else turning
+        own = [str(j + 1) for j, slides in enumerate(self.slides) if slides]
         return f"{turning} ({sliding} of joint {', '.join(own)})" if own else turning
 
     def joint_index(self, name: str) -> int:

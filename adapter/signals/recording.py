@@ -16,7 +16,6 @@ GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is c
 _LISTED = 10  # gaps and topics that are listed one by one
 _SLIDING = {"q_rad": "m", "dq_rad_s": "m/s", "tau_nm": "N"}
 _FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
-_RAIL_M = 30.0  # beyond which no joint slides
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
@@ -177,8 +176,7 @@ def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array, slides: Seque
     degrees = mcap.looks_like_degrees(q[:, turning])
     said = ["positions look like degrees" if degrees else "positions rad"]
     if slides:
-        furthest = np.nanmax(np.abs(np.delete(q, np.flatnonzero(turning), axis=1)), initial=0.0)
-        said[0] += f" (m of {', '.join(slides)}{'; mm?' * bool(furthest > _RAIL_M)})"
+        said[0] += f" (m of {', '.join(slides)})"
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = np.abs(np.concatenate([mcap.derive_velocity(x.stamp_ns, x.q) for x in parts]))
         fast = slope > _FAST

@@ -16,13 +16,13 @@ from drivers.errors import choices
 from drivers.files.mcap import Commands
 from drivers.interface import Array, DriverError
 
-SLIDING = {"m": 1.0, "mm": 1e-3, "N": 1.0}  # units of joints that slide
-_PLACES = {"rad": 1.0, "deg": np.pi / 180, "m": SLIDING["m"], "mm": SLIDING["mm"]}
+SLIDING = "m", "mm", "N"  # units of joints that do
+_PLACES = {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3}
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "q": _PLACES,
     "dq": _PLACES,
-    "tau": {"Nm": 1.0, "mNm": 1e-3, "N": SLIDING["N"]},
+    "tau": {"Nm": 1.0, "mNm": 1e-3, "N": 1.0},
     "cmd": _PLACES,
 }
 SIGNALS = tuple(UNITS)

@@ -187,8 +187,8 @@ def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
     names, at, rows, said = _positions(read, scan.path, None)
     _, when, commands, _ = _positions(commanded, scan.path, names, asked)
     if topic is None and states != JOINT_STATES:
-        both = f"those of {states}" if asked == Q else f"feedback and reference of {states}"
-        said.append(f"{scan.path}: positions and commands are {both}")
+        both = "s are those" if asked == Q else "s and commands are feedback and reference"
+        said.append(f"{scan.path}: position{both} of {states}")
     nothing, warnings = np.full_like(rows, np.nan), scan.warnings + said
     orders = Commands(when, np.full_like(commands, np.nan), commands)
     return Log(
