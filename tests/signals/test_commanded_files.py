@@ -264,7 +264,7 @@ def test_which_topics_tell_commands(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "those of /dynamic_joint_states" in said and "/servo/delta jogs: steps and" in said
     alone = write_ros2(tmp_path / "b", topics)
-    assert "efforts that are not a number" in refusal(capsys, alone)
+    assert "/dynamic_joint_states has efforts that are not a number" in refusal(capsys, alone)
     assert main(["info", str(alone)]) == 0 and "/servo/delta jogs" in capsys.readouterr().out
     two = write_controller_states(tmp_path / "c", NEW, motion, ("/left", "/right"))
     assert "2 topics tell positions and commands: /left, /right; choose" in refusal(capsys, two)

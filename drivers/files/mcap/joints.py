@@ -22,7 +22,10 @@ from drivers.interface import Array, DriverError
 
 _IN_MEMORY = 2**20  # bytes of a column that stay in memory
 _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
-_NEED = "learning needs positions and measured joint torques (effort)"
+_NEED = (
+    "learning needs positions and measured joint torques (effort); of positions with commanded "
+    "ones beside them `adapter gap` tells the servos"
+)
 Q, DQ, TAU, GOAL = range(4)  # runs of doubles in a message; few kinds have the last one
 _CALLED = {Q: "position", TAU: "effort", GOAL: "reference"}
 _CLOCKS = attrgetter("stamp_ns"), attrgetter("log_ns")  # of a block

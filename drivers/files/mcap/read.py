@@ -317,6 +317,9 @@ def _choose_topic(
     if fitting:
         scan.warnings.append(f"{scan.path}: joint states are those of {fitting[0]}")
         return topics[fitting[0]]
+    silent = [s for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, Q)]
+    if series is None and topic is None and len(silent) == 1:
+        return silent[0]  # which lacks efforts, and that is what is said
     if series is None or not series.count:
         raise DriverError(_nothing_found(scan, topics, topic or JOINT_STATES))
     return series
