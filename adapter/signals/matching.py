@@ -137,11 +137,9 @@ def corresponding(
     if len(starts) == 1:  # of a namespace, beside joints of other things
         said = f"{what} names are taken without the {starts[0]} before them"
         return [f"{starts[0]}{name}" for name in want], [said]
-    if len(have) != len(want):
-        return [name if name in have else None for name in want], []
     number = {_number(name): name for name in have}
     found = [number.get(_number(name)) for name in want]
-    if len(number) < len(have) or None in found or "" in number:
+    if not len(want) == len(have) == len(number) or None in found or "" in number:
         return [name if name in have else None for name in want], []
     pairs = ", ".join(f"{a} = {b}" for a, b in zip(found, want, strict=True))
     return found, [f"{what} names differ and are matched by their numbers: {pairs}"]
