@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from importlib import import_module
+from itertools import compress
 
 import numpy as np
 
+from adapter.cli.common import robot_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
 from adapter.effects.base import with_squares
@@ -80,13 +82,15 @@ def run_info(args: argparse.Namespace) -> int:
         }
     else:
         log = opened(args)
-        facts = describe(args.file if log is None else log, args.topic)
+        robot = None if args.robot is None else robot_of(args, args.robot)
+        slides = () if robot is None else compress(robot.tree.joint_names, robot.tree.slides)
+        facts = describe(args.file if log is None else log, args.topic, tuple(slides))
         lines = summary(facts)
         teaching = facts["problem"] is None and facts["tracking_error_rad"] is None
-        if args.robot is not None and teaching:
+        if robot is not None and teaching:
             # What predicts brings torch, which the rest of this file can do without.
             predict = import_module("adapter.cli.teachable").predict
-            facts["teachable"], more = predict(args, log)
+            facts["teachable"], more = predict(args, robot, log)
             lines += more
     write_json(args.json, facts)
     for line in lines:

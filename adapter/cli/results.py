@@ -23,6 +23,7 @@ from adapter.gap.servo_model import read_servos
 from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
+from adapter.model.tree import Tree
 from adapter.report import write_report
 from adapter.report.next_steps import next_steps
 from adapter.report.trust import headline
@@ -93,7 +94,7 @@ def print_figures(data: RunData, report: str | None, accounts: Sequence[str]) ->
     worth = Worth.of(data)
     for number, said in enumerate(headline(data, worth)):
         output.print(said, style="bold" if number == 0 else "", soft_wrap=True)
-    output.print(_figures(data.figures, report))
+    output.print(_figures(data.figures, data.documented.tree, report))
     for line in accounts:
         output.print(line, style="dim", soft_wrap=True, highlight=False)
     for step in next_steps(data, worth):
@@ -102,7 +103,7 @@ def print_figures(data: RunData, report: str | None, accounts: Sequence[str]) ->
             output.print(f"  {step.command}", soft_wrap=True)
 
 
-def _figures(figures: dict[str, Any], report: str | None) -> Table:
+def _figures(figures: dict[str, Any], tree: Tree, report: str | None) -> Table:
     start_s = figures.get("start_s") or 0.0
     lam, theta = figures["lambda"], figures["theta"]
     table = Table("", Column("", overflow="fold"), show_header=False, box=None, pad_edge=False)
@@ -123,7 +124,8 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     for words in lam["filled"]:
         table.add_row("  from the documentation", words)
     rmse = theta["torque_rmse_nm"]
-    fit = f"; fit {max(rmse):.3f} N m on the worst joint" if rmse else ""
+    unit = tree.unit("N m", "N", rmse.index(max(rmse))) if rmse else ""
+    fit = f"; fit {max(rmse):.3f} {unit} on the worst joint" if rmse else ""
     table.add_row("θ", _reached(figures, "theta") + fit)
     for change in theta["changes"]:
         load = change.get("payload")
@@ -135,7 +137,7 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
         table.add_row("new disagreement", line)
     if theta["validation_torque_rmse_nm"]:
         values = " ".join(f"{value:.3f}" for value in theta["validation_torque_rmse_nm"])
-        table.add_row("held-out torque", f"{values} N m")
+        table.add_row("held-out torque", f"{values} {tree.unit('N m', 'N')}")
     table.add_row("model", figures["model"])
     if report:
         table.add_row("report", report)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from adapter.cli.common import robot_of, told_of
+from adapter.cli.common import told_of
 from adapter.control.teachable import teachable
+from adapter.model.self_model import SelfModel
 from adapter.screening.screen import RecordingRefused, check_torque
 from adapter.signals.matching import matching, most_moved, present
 from drivers.files.mcap import Log, read_log
 
 
-def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str, Any], list[str]]:
+def predict(
+    args: argparse.Namespace, robot: SelfModel, log: Log | None = None
+) -> tuple[dict[str, Any], list[str]]:
     """What the recording teaches of a robot: figures and lines."""
     whole = log or read_log(args.file, topic=args.topic)
-    robot = robot_of(args, args.robot)
     robot, locked = present(robot, whole.joint_names, whole.path)
     log = told_of(args).log(matching(most_moved(whole), robot), robot)
     if len(log) < len(whole):
@@ -54,7 +56,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         f"can be learned from: {teaches}",
         f"{robot.name}: tells {told.rank} of the {told.full_rank} combinations of parameters that "
         "torques depend on",
-        f"torque that no parameters explain, N m: {noise}",
+        f"torque that no parameters explain, {robot.tree.unit('N m', 'N')}: {noise}",
         *(f"missing: {sentence}" for sentence in told.missing),
         *(f"{part}: {', '.join(said) or 'nothing shown'}" for part, said in parts.items()),
     ]

@@ -14,7 +14,9 @@ from adapter.model.self_model import LIMITS, FixedFrame, Limits, SelfModel, Tool
 from adapter.model.spatial import Array, at_joints, matrix_from_zxz, z_to_axis, zxz_from_matrix
 from adapter.model.tree import BASE, Tree
 
-LOCKED = "locked"  # entry of `SelfModel.provenance`: values of locked joints by name, rad or m
+# Entries of `SelfModel.provenance`: values of locked joints by name, rad or m; and of joints that
+# follow another (mimic) its name, the factor and the offset to it, and the unit of both.
+LOCKED, FOLLOWS = "locked", "follows"
 
 
 def restricted(

@@ -17,15 +17,16 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.inertia import body_from_theta, move_theta
-from adapter.model.locking import LOCKED
+from adapter.model.locking import FOLLOWS, LOCKED
 from adapter.model.self_model import (
     STANDARD_GRAVITY,
     FixedFrame,
@@ -162,24 +163,26 @@ class FileRobot:
     source: Source
 
     def value(self, joint: FileJoint, moving: set[str], lock: Mapping[str, float]) -> float:
-        """Where a joint that does not move stands, rad or m: as told, after its leader, or 0."""
-        seen, factor, offset = {joint.name}, 1.0, 0.0
-        while joint.name not in lock and joint.mimic is not None:
-            leader, times, plus = joint.mimic
-            factor, offset = factor * times, offset + factor * plus
-            if leader in moving or leader in seen or leader not in self.joints:
-                return 0.0
-            seen.add(leader)
-            joint = self.joints[leader]
-        return factor * lock.get(joint.name, 0.0) + offset
+        """Where a joint that does not move stands, rad or m: as told, or after its leader.
 
-    def leader(self, joint: FileJoint) -> str:
-        """Name of the joint that one follows, be it through others; else its own."""
-        seen = {joint.name}
-        while joint.mimic is not None and joint.mimic[0] in self.joints.keys() - seen:
-            joint = self.joints[joint.mimic[0]]
-            seen.add(joint.name)
-        return joint.name
+        A leader that moves, or of which nothing is told, is at zero.
+        """
+        leader, factor, offset = self.followed(joint, moving | lock.keys())
+        return factor * lock.get(leader, 0.0) + offset
+
+    def followed(self, joint: FileJoint, last: Set[str] = frozenset()) -> tuple[str, float, float]:
+        """Name of the joint that one follows, be it through others up to one of `last`; its own
+        where it follows none. With the factor and the offset of its value to that one's.
+        """
+        seen, factor, offset = {joint.name}, 1.0, 0.0
+        while joint.mimic is not None and joint.name not in last:
+            name, times, plus = joint.mimic
+            if name in seen or name not in self.joints:
+                break
+            factor, offset = factor * times, offset + factor * plus
+            seen.add(name)
+            joint = self.joints[name]
+        return joint.name, factor, offset
 
 
 def _root(robot: FileRobot) -> str:
@@ -217,10 +220,14 @@ def _moving(robot: FileRobot, wanted: Sequence[str] | None, lock: Mapping[str, f
         raise ModelError(f"{robot.file}: joint '{both}' cannot be learned and locked; do one")
     for joint in robot.joints.values():
         if joint.name not in (*chosen, *lock) and joint.kind != "fixed":
-            value, leader = robot.value(joint, chosen, lock), robot.leader(joint)
+            value, leader = robot.value(joint, chosen, lock), robot.followed(joint, chosen)[0]
             follows = f" and mimics {leader}" if joint.mimic else ""
             if leader in chosen:
                 why = "no model here follows; what it takes is not in its leader"
+                below = _below(robot, joint)
+                borne = [x for x, j in robot.joints.items() if x in chosen and j.parent in below]
+                if borne:
+                    why += f", and {', '.join(borne)} behind it will not be where they are"
                 follows += f", which moves ({why})"
             at = "zero" if value == 0.0 else f"{value:.6g}"
             finger = joint in own and wanted is None
@@ -230,19 +237,24 @@ def _moving(robot: FileRobot, wanted: Sequence[str] | None, lock: Mapping[str, f
     return chosen
 
 
+def _below(robot: FileRobot, joint: FileJoint) -> set[str]:
+    """The links that a joint moves, its own child and all that hang on it."""
+    links, found = {joint.child}, 0
+    while len(links) > found:
+        found = len(links)
+        links |= {j.child for j in robot.joints.values() if j.parent in links}
+    return links
+
+
 def _finger(robot: FileRobot, joint: FileJoint) -> bool:
     """Whether a joint slides a finger: it carries none that turns, and has another beside it on its
     link, is followed by one that mimics it, or is named so."""
     if joint.kind not in SLIDING:
         return False
-    links, found = {joint.child}, 0
-    while len(links) > found:
-        found = len(links)
-        links |= {j.child for j in robot.joints.values() if j.parent in links}
-    every = robot.joints.values()
+    links, every = _below(robot, joint), robot.joints.values()
     if any(j.kind in TURNING and j.parent in links and j.mimic is None for j in every):
         return False
-    followed = any(robot.leader(j) == joint.name for j in every if j is not joint)
+    followed = any(robot.followed(j)[0] == joint.name for j in every if j is not joint)
     beside = sum(j.kind in SLIDING and j.parent == joint.parent for j in every) > 1
     return followed or beside or any(word in joint.name.lower() for word in FINGERS)
 
@@ -352,6 +364,15 @@ class Merged:
         check_moving(file, bodies)
         check_links(file, self.robot.links)
 
+    def _followers(self) -> dict[str, tuple[str, float, float, str]]:
+        """Entry `FOLLOWS` of the model's provenance."""
+        found = {}
+        for joint in self.robot.joints.values():
+            leader, factor, offset = self.robot.followed(joint, self.moving)
+            if leader != joint.name and joint.name not in self.moving | self.lock.keys():
+                found[joint.name] = leader, factor, offset, "m" if joint.kind in SLIDING else "rad"
+        return found
+
     def model(self, floating: bool, gravity: Array) -> SelfModel:
         """The self model of what was walked.
 
@@ -374,7 +395,9 @@ class Merged:
             tuple(joint.kind in SLIDING for joint in joints),
         )
         theta = np.stack([body.theta for body in order])
-        locked = {LOCKED: dict(self.lock)} if self.lock else {}
+        told: dict[str, Any] = {LOCKED: dict(self.lock)} if self.lock else {}
+        if followers := self._followers():
+            told[FOLLOWS] = followers
         lam = np.stack([np.r_[zxz_from_matrix(b.rotation), b.position] for b in order])
         return SelfModel(
             name=self.robot.name,
@@ -387,5 +410,5 @@ class Merged:
             frames=tuple(self.frames),
             gravity=gravity,
             source=replace(self.robot.source, lam=lam),
-            provenance={self.robot.source.format: Path(self.robot.file).name, **locked},
+            provenance={self.robot.source.format: Path(self.robot.file).name, **told},
         )

@@ -94,6 +94,13 @@ class Tree:
             link = self.parent[link]
         return tuple(reversed(path))
 
+    def unit(self, turning: str, sliding: str, joint: int | None = None) -> str:
+        """The unit of a joint (from 0), or of all: `N m (N of joint 1)` where the first slides."""
+        if joint is not None:
+            return sliding if self.slides[joint] else turning
+        own = [str(j + 1) for j, slides in enumerate(self.slides) if slides]
+        return f"{turning} ({sliding} of joint {', '.join(own)})" if own else turning
+
     def joint_index(self, name: str) -> int:
         """Index of a joint by name. Raises ModelError with the names there are."""
         if name not in self.joint_names:

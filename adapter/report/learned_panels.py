@@ -285,5 +285,6 @@ def fit_panels(data: RunData) -> list[Panel]:
         below.set_xlim(t[0], t[-1])
         time_axis(drawing)
         rms = float(np.sqrt(np.mean(left**2)))
-        panels.append(drawing.panel(f"Joint {j + 1}", "N m", f"residual {rms:.3g} N m rms"))
+        unit = data.documented.tree.unit("N m", "N", j)
+        panels.append(drawing.panel(f"Joint {j + 1}", unit, f"residual {rms:.3g} {unit} rms"))
     return panels

@@ -77,6 +77,7 @@ def joint_tables(data: RunData) -> list[Table]:
     schema, theta = data.figures["lambda"], data.figures["theta"]
     std = schema.get("std") or {}
     names = ("Joint", "", list(data.documented.tree.joint_names))
+    torque = data.documented.tree.unit("N m", "N")
     columns: list[tuple[str, str, list[str]]] = [names]
     for head, unit, key, std_key, at in (
         ("Turn error", "mrad", "rotation_error_rad", "rotation_rad", slice(0, 3)),
@@ -90,11 +91,11 @@ def joint_tables(data: RunData) -> list[Table]:
             columns.append((f"± {head.split()[0].lower()}", unit, _column(known, 1e3)))
     if theta_started(data):
         measured = np.sqrt(np.mean(data.score_signals()[3] ** 2, axis=0))
-        columns.append(("Torque, rms", "N m", _column(measured)))
+        columns.append(("Torque, rms", torque, _column(measured)))
     if theta.get("torque_rmse_nm"):
-        columns.append(("Not explained", "N m rms", _column(theta["torque_rmse_nm"])))
+        columns.append(("Not explained", f"{torque} rms", _column(theta["torque_rmse_nm"])))
     if theta.get("validation_torque_rmse_nm"):
-        columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
+        columns.append(("Held out", f"{torque} rms", _column(theta["validation_torque_rmse_nm"])))
     effects = effect_columns(active_effects(data.model.effects, data.n), data.model.tree)
     more = [(head, unit, cells) for (head, unit), cells in effects.items()]
     return [by_column(columns), *([by_column([names, *more])] if more else [])]

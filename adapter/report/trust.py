@@ -48,8 +48,8 @@ def headline(data: RunData, worth: Worth) -> list[str]:
     if why := refusal(data.figures):
         found = [f"Nothing was learned, since the torques are not those of this arm: {why}"]
     else:
-        found = [*_lacks(worth), *_torque(data, worth), *_tracking(worth), *_loads(data, worth)]
-        found += _hand(data, worth)
+        found = [*_lacks(data, worth), *_torque(data, worth), *_tracking(worth)]
+        found += [*_loads(data, worth), *_hand(data, worth)]
     real = is_live(data.figures) and not is_simulated(data.figures)  # a simulated arm waits
     late = [f"{capital(missed_words(data.figures))}."] if real else []
     return [*found, *_trouble(data.figures), *late]
@@ -60,12 +60,12 @@ def against(figures: Mapping[str, Any]) -> str:
     return Path(str(figures["lambda"].get("reference") or DOCUMENTATION)).name
 
 
-def _lacks(worth: Worth) -> list[str]:
+def _lacks(data: RunData, worth: Worth) -> list[str]:
     """What the documentation has otherwise, the most first; nothing where it has all of it."""
     parts, bodies, fall = finding_parts(worth.lacks), worth.bodies_nm, worth.torque
     if fall is not None and bodies is not None and (bodies > fall.after).any():
         j = int(np.argmax(bodies))
-        size = quantity(bodies[j], "N m", 2)
+        size = quantity(bodies[j], data.documented.tree.unit("N m", "N", j), 2)
         parts.insert(0, f"links weigh otherwise, by up to {size} of torque (joint {j + 1})")
     return [f"This arm is not as documented: {'; '.join(map(tied, parts))}."] if parts else []
 
@@ -87,16 +87,17 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
         if not theta_started(data):
             return ["Torque was not learned, because λ (where the joints' frames are) was not."]
         return ["Too little was learned from to say what the learned model is worth."]
-    after = _all_joints(fall.after, fall.after_std)
+    tree = data.documented.tree
+    after = _all_joints(fall.after, fall.after_std, tree.unit("N m", "N"))
     if fall.before is None:
         return [f"The learned model predicts torque to {after} ({fall.seen})."]
-    before = _all_joints(fall.before, fall.before_std)
+    before = _all_joints(fall.before, fall.before_std, tree.unit("N m", "N"))
     if not (fall.better or fall.worse):
         both = f"to {after}, the documentation to {before} ({fall.seen})"
         return [f"The learned model predicts torque as the documentation does: {both}."]
     more = np.square(fall.after) - np.square(fall.before)
     j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
-    first, last = (quantity(x[j], "N m", 2) for x in (fall.before, fall.after))
+    first, last = (quantity(x[j], tree.unit("N m", "N", j), 2) for x in (fall.before, fall.after))
     worst = f"joint {j + 1} {first} → {last}"
     verb = "fell" if fall.better else "rose"
     return [
@@ -105,11 +106,11 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
     ]
 
 
-def _all_joints(values: Any, std: Any) -> str:
+def _all_joints(values: Any, std: Any, unit: str) -> str:
     """All joints together, ± one standard deviation where it is known."""
     size = together(values)
     spread = None if std is None else float(np.sqrt(np.sum((values * std) ** 2))) / max(size, 1e-12)
-    return f"{with_doubt(size, spread)} N m".replace(" ", NARROW)
+    return f"{with_doubt(size, spread)} {unit}".replace(" ", NARROW)
 
 
 def _loads(data: RunData, worth: Worth) -> list[str]:
@@ -193,10 +194,10 @@ def _unseen(data: RunData, worth: Worth) -> Check | None:
         nothing = Check(BAD, "On data not learned from", "nothing to judge by")
         return nothing if theta_started(data) else None
     fit = np.array(data.figures["theta"]["torque_rmse_nm"], float)
-    ratio = fall.after / np.maximum(fit, 1e-12)
+    ratio, unit = fall.after / np.maximum(fit, 1e-12), data.documented.tree.unit("N m", "N")
     said = (
         f"the worst joint's torque error, {fall.seen}, is {number(ratio.max(), 2)} times that of "
-        f"the fit (joint {int(np.argmax(ratio)) + 1}): {spread(fall.after, 'N m')} rms by joint"
+        f"the fit (joint {int(np.argmax(ratio)) + 1}): {spread(fall.after, unit)} rms by joint"
     )
     if fall.worse:
         return Check(BAD, "On data not learned from", f"{said}; worse than the documentation")
@@ -212,7 +213,8 @@ def _left(data: RunData) -> Check | None:
         return None
     size = rms_of([data.score_signals()[3]]).value
     share = 100.0 * np.array(left) / np.maximum(size, 1e-12)
-    said = f"{spread(left, 'N m')} rms by joint, {spread(share, '%')} of the torque that acted"
+    unexplained = spread(left, data.documented.tree.unit("N m", "N"))
+    said = f"{unexplained} rms by joint, {spread(share, '%')} of the torque that acted"
     slow = slow_share(data)
     if slow is None:
         return Check(LOOK, LEFT, f"{said}; too short to tell whether it is noise")

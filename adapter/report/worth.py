@@ -275,22 +275,23 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
     """One row per joint: torque and tracking errors before and after; None where neither is
     known."""
     columns: list[tuple[str, str, list[str]]] = []
-    torque, tracking = worth.torque, worth.tracking
+    torque, tracking, tree = worth.torque, worth.tracking, data.documented.tree
+    unit, off = f"{tree.unit('N m', 'N')} rms", f"{tree.unit('mrad', 'mm')} rms"
     if torque is not None:
         if torque.size is not None:
-            columns.append(("Torque that acted", "N m rms", [number(x) for x in torque.size]))
+            columns.append(("Torque that acted", unit, [number(x) for x in torque.size]))
         if torque.before is not None:
             before = _values(torque.before, torque.before_std)
-            columns.append(("Error, documented model", "N m rms", before))
+            columns.append(("Error, documented model", unit, before))
         after = _values(torque.after, torque.after_std)
-        columns.append(("Error, learned model", "N m rms", after))
+        columns.append(("Error, learned model", unit, after))
         if torque.before is not None:
             shares = 100.0 * (torque.after / np.maximum(torque.before, 1e-12) - 1.0)
             changes = [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]
             columns.append(("Change", "", changes))
     if tracking is not None and tracking.before is not None:
-        columns.append(("Path error, feedback alone", "mrad rms", _values(1e3 * tracking.before)))
-        columns.append(("Path error, with model", "mrad rms", _values(1e3 * tracking.after)))
+        columns.append(("Path error, feedback alone", off, _values(1e3 * tracking.before)))
+        columns.append(("Path error, with model", off, _values(1e3 * tracking.after)))
     if not columns:
         return None
     return by_column([("Joint", "", list(data.documented.tree.joint_names)), *columns])
@@ -305,12 +306,15 @@ def worth_panels(data: RunData, worth: Worth) -> list[Panel]:
     """Errors of every joint before and after, where both are known."""
     panels = []
     torque, tracking = worth.torque, worth.tracking
-    names = data.documented.tree.joint_names
+    tree = data.documented.tree
+    names = tree.joint_names
     if torque is not None and torque.before is not None:
         drawing = fall_drawing(torque.before, torque.after, None, names)
-        panels.append(drawing.panel("Torque error by joint", "N m rms", torque.seen))
+        unit = f"{tree.unit('N m', 'N')} rms"
+        panels.append(drawing.panel("Torque error by joint", unit, torque.seen))
     if tracking is not None and tracking.before is not None:
         drawing = fall_drawing(1e3 * tracking.before, 1e3 * tracking.after, None, names)
         note = f"feedback alone, and with the feed-forward of the {tracking.seen}"
-        panels.append(drawing.panel("Path error by joint", "mrad rms", note))
+        off = f"{tree.unit('mrad', 'mm')} rms"
+        panels.append(drawing.panel("Path error by joint", off, note))
     return panels

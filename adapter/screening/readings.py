@@ -151,8 +151,9 @@ class Readings:
     def _off(self, tau: Array, joints: Sequence[int]) -> str:
         before, after = (rms((x - self.model)[:, joints]) for x in (self.rows.tau, tau))
         there = " there" if len(joints) < len(self.names) else ""
-        so = f"as recorded and by {after:.3g} N m so understood"
-        return f"the model is off by {before:.3g} N m{there} {so}"
+        unit = self.telling.model.tree.unit("N m", "N", joints[0] if len(joints) == 1 else None)
+        so = f"as recorded and by {after:.3g} {unit} so understood"
+        return f"the model is off by {before:.3g} {unit}{there} {so}"
 
     def _signs(self) -> Iterator[Reading]:
         alive = np.flatnonzero(self.telling.alive).tolist()

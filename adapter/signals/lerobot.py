@@ -14,6 +14,7 @@ from drivers.files.mcap import Log, read_log, read_position_log
 from drivers.interface import Array, DriverError
 
 _PART = "chunk-000/file-000.parquet"
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _TASK = {"task": ["motion"], "task_index": [0]}
 _INDEXED = {  # so that pandas takes the tasks for the index, as LeRobot does
     "index_columns": ["task"],
@@ -61,6 +62,7 @@ def write_lerobot(path: Path, folder: Path) -> list[str]:
     for key, x in {**told, **single}.items():
         table = x.reshape(rows, -1)
         stats[key] = {k: getattr(table, k)(axis=0).tolist() for k in ("min", "max", "mean", "std")}
+        stats[key] |= {k: np.quantile(table, q, axis=0).tolist() for k, q in _QUANTILES.items()}
         stats[key]["count"] = [rows]
     episode = {"episode_index": 0, "tasks": _TASK["task"], "length": rows}
     episode |= {"dataset_from_index": 0, "dataset_to_index": rows}

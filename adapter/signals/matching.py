@@ -6,10 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adapter.model.locking import locked
+from adapter.model.locking import FOLLOWS, locked
 from adapter.model.self_model import SelfModel
 from drivers.files.mcap import IN_MEMORY, Log
 from drivers.interface import DriverError
+
+# What a joint may be off the one that it follows: play, in rad or m, and a share of its motion
+FOLLOWED, FOLLOWED_SHARE = 1e-3, 0.1
 
 
 def present(
@@ -27,7 +30,10 @@ def present(
     Returns:
         The robot, and a sentence where joints were locked.
     """
-    still = [frame.joint for frame in documented.frames if frame.joint in names]
+    followers = documented.provenance.get(FOLLOWS, {})  # `matching` checks those with their leader
+    checked = [name for name, (leader, *_) in followers.items() if leader in names]
+    held = [frame.joint for frame in documented.frames if frame.joint in names]
+    still = [name for name in held if name not in checked]
     how = "holds still (--joints A,B,... with them among these learns them)"
     idle = [f"{source}: has {', '.join(still)}, which {documented.name} {how}"] if still else []
     absent = [name for name in documented.tree.joint_names if name not in names]
@@ -98,9 +104,27 @@ def matching(log: Log, documented: SelfModel) -> Log:
             f"{log.path}: motion of not all links was recorded (twists and accelerations of "
             f"{', '.join(tree.link_names)}); link motion is synthesized instead"
         )
+    more += _strayed(log, documented)
     log = log.select([name for name in joints if name], [name for name in links if name and heard])
     log.warnings.extend(warnings + more)
     return log
+
+
+def _strayed(log: Log, documented: SelfModel) -> list[str]:
+    """Sentences on recorded joints that do not follow others as the robot's file says."""
+    found = []
+    for name, (leader, factor, offset, unit) in documented.provenance.get(FOLLOWS, {}).items():
+        if not {name, leader} <= {*log.joint_names}:
+            continue
+        own, led = (
+            np.concatenate([part.q[:, log.joint_names.index(x)] for part in log.spread()])
+            for x in (name, leader)
+        )
+        off = float(np.sqrt(np.nanmean((own - factor * led - offset) ** 2)))
+        if off > max(FOLLOWED, FOLLOWED_SHARE * float(np.nanstd(own))):
+            said = f"{factor:g} times {leader} plus {offset:g}, as {documented.name} has it"
+            found.append(f"{log.path}: {name} is {off:.3g} {unit} (rms) off {said}")
+    return found
 
 
 def corresponding(
@@ -113,11 +137,9 @@ def corresponding(
     if len(starts) == 1:  # of a namespace, beside joints of other things
         said = f"{what} names are taken without the {starts[0]} before them"
         return [f"{starts[0]}{name}" for name in want], [said]
-    if len(have) != len(want):
-        return [name if name in have else None for name in want], []
     number = {_number(name): name for name in have}
     found = [number.get(_number(name)) for name in want]
-    if len(number) < len(have) or None in found or "" in number:
+    if not len(want) == len(have) == len(number) or None in found or "" in number:
         return [name if name in have else None for name in want], []
     pairs = ", ".join(f"{a} = {b}" for a, b in zip(found, want, strict=True))
     return found, [f"{what} names differ and are matched by their numbers: {pairs}"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,13 +14,17 @@ from drivers.interface import Array, DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
 _LISTED = 10  # gaps and topics that are listed one by one
+_SLIDING = {"q_rad": "m", "dq_rad_s": "m/s", "tau_nm": "N"}
 _FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
-def describe(path: str | Path | mcap.Log, topic: str | None = None) -> dict[str, Any]:
+def describe(
+    path: str | Path | mcap.Log, topic: str | None = None, slides: Sequence[str] = ()
+) -> dict[str, Any]:
     """A recording's contents and health, ready for JSON.
 
+    Joints that are known to slide are `slides`: their numbers are m, m/s and N under all keys.
     Of a file without usable joint states only its topics are told, and `problem` says what is
     missing. Keys: file, bytes, truncated, problem, topics, warnings; with joint states also
     joints, source (topic or columns of the joint states), units, teaches, links, frames (topics
@@ -28,7 +32,8 @@ def describe(path: str | Path | mcap.Log, topic: str | None = None) -> dict[str,
     judged from a sample, and a warning says so), start_s, duration_s,
     rate_hz, period_ms, jitter_ms, repeated_samples, repeated_stamps, backward_steps, not_finite,
     gaps, range, metadata, attachments; commands (how many), commanded (positions or torques);
-    tracking_error_rad, rms of command less position of each joint where there are no efforts.
+    tracking_error_rad, rms of command less position of each joint where there are no efforts;
+    slides, the joints that do.
 
     Raises:
         DriverError: the file is unreadable, empty or not MCAP.
@@ -42,7 +47,8 @@ def describe(path: str | Path | mcap.Log, topic: str | None = None) -> dict[str,
     else:
         first, warnings = looked.parts[0], looked.warnings
         topics, truncated = first.topics, first.truncated
-        facts = {"problem": None, **_joint_facts(looked), **_timing(looked)}
+        own = [name for name in first.joint_names if name in slides]
+        facts = {"problem": None, **_joint_facts(looked, own), **_timing(looked), "slides": own}
     return {
         "file": str(path),
         "bytes": sum(p.stat().st_size for p in (path, *path.rglob("*")) if p.is_file()),
@@ -98,8 +104,10 @@ def _read(path: Path, topic: str | None) -> mcap.Log:
     except DriverError as error:
         trouble = error
     if log is None or not (log.is_mapped or np.any(np.nan_to_num(log.tau))):
-        with suppress(DriverError):  # the first one says what is wrong
+        try:
             log = mcap.read_position_log(path, topic) or log
+        except DriverError as error:  # it found commands, and knows more of what is wrong
+            trouble = error
     if log is None:
         assert trouble is not None
         raise trouble
@@ -135,6 +143,7 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
         steps = f", steps {period['p50']:.3g} ms ({longest})"
     others = [f"{facts['commands']} commanded {facts['commanded']}"] if facts["commands"] else []
     off = [f"{1e3 * x:.3g}" for x in facts["tracking_error_rad"] or ()]
+    unit = f"mrad{_sliding(facts, 'mm')}"
     others += [f"motion of {name}" for name in (*facts["links"], *facts["frames"])]
     return [
         f"joints: {count}, {', '.join(facts['joints'])}",
@@ -147,17 +156,27 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
         f"{facts['backward_steps']} steps back in time; {facts['not_finite']} not a number",
         *(
             f"{name}: {'  '.join(map('{:.3g}..{:.3g}'.format, found['min'], found['max']))}"
+            + _sliding(facts, _SLIDING[name])
             for name, found in facts["range"].items()
         ),
-        *([f"command less position, rms: {'  '.join(off)} mrad"] if off else []),
+        *([f"command less position, rms: {'  '.join(off)} {unit}"] if off else []),
         f"units: {facts['units']}",
         f"can teach: {facts['teaches']}",
     ]
 
 
-def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array) -> str:
+def _sliding(facts: dict[str, Any], unit: str) -> str:
+    """In which unit a line tells joints that slide; nothing where there are none."""
+    return f" ({unit} of {', '.join(facts['slides'])})" if facts["slides"] else ""
+
+
+def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array, slides: Sequence[str]) -> str:
     """What the numbers look like; a joint's torque has no size that all arms share."""
-    said = ["positions look like degrees" if mcap.looks_like_degrees(q) else "positions rad"]
+    turning = [name not in slides for name in parts[0].joint_names]
+    degrees = mcap.looks_like_degrees(q[:, turning])
+    said = ["positions look like degrees" if degrees else "positions rad"]
+    if slides:
+        said[0] += f" (m of {', '.join(slides)})"
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = np.abs(np.concatenate([mcap.derive_velocity(x.stamp_ns, x.q) for x in parts]))
         fast = slope > _FAST
@@ -171,7 +190,7 @@ def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array) -> str:
     else:
         said.append(f"velocities {ratio:.3g} times the slope of the positions")
     most = float(np.nanmax(np.abs(tau), initial=0.0))
-    return ", ".join([*said, f"efforts up to {most:.3g}, taken as N m"])
+    return ", ".join([*said, f"efforts up to {most:.3g}, taken as N m{' (N)' * bool(slides)}"])
 
 
 def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
@@ -196,7 +215,7 @@ def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
     return "; ".join([*said, "--robot NAME|FILE predicts the parameters"])
 
 
-def _joint_facts(looked: _Looked) -> dict[str, Any]:
+def _joint_facts(looked: _Looked, slides: Sequence[str]) -> dict[str, Any]:
     log, parts = looked.parts[0], looked.parts
     tables = (np.concatenate([getattr(x, key) for x in parts]) for key in ("q", "dq", "tau"))
     signals = dict(zip(("q_rad", "dq_rad_s", "tau_nm"), tables, strict=True))
@@ -219,7 +238,7 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
     return {
         "joints": list(log.joint_names),
         "source": log.topic,
-        "units": _units(parts, q, dq, tau),
+        "units": _units(parts, q, dq, tau, slides),
         "teaches": _teaches(looked, dq, tau),
         "links": list(log.link_names),
         "frames": [f"{m.topic} ({m.frame})" for m in log.frames if m.frame not in log.link_names],

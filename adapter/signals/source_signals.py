@@ -16,12 +16,14 @@ from drivers.errors import choices
 from drivers.files.mcap import Commands
 from drivers.interface import Array, DriverError
 
+SLIDING = "m", "mm", "N"  # units of joints that do
+_PLACES = {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3}
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "q": {"rad": 1.0, "deg": np.pi / 180},
-    "dq": {"rad": 1.0, "deg": np.pi / 180},
-    "tau": {"Nm": 1.0, "mNm": 1e-3},
-    "cmd": {"rad": 1.0, "deg": np.pi / 180},
+    "q": _PLACES,
+    "dq": _PLACES,
+    "tau": {"Nm": 1.0, "mNm": 1e-3, "N": 1.0},
+    "cmd": _PLACES,
 }
 SIGNALS = tuple(UNITS)
 ALL = ""  # the source of every signal that has none of its own
@@ -60,8 +62,8 @@ class ImportSpec:
             folder of a LeRobot data set, or one of SAGE with its `control.csv`.
         columns: selectors of each signal in its file (`SourceTable.places`), or the key
             in an .npz. Where absent: the usual names, or the whole of a signal's own file.
-        units: time s, ms, us, ns; q rad, deg; dq (per second) and cmd likewise, that of q where
-            absent; tau Nm, mNm.
+        units: time s, ms, us, ns; q rad, deg, m, mm; dq (per second) and cmd likewise, that of q
+            where absent; tau Nm, mNm, N. Headers may say another one for each column.
         joint_names: those wanted. Where the source tells no names they are those of its columns;
             joint1, joint2, ... where empty.
         names: joints of the source and what they are called; `left_*` to `*` takes off a prefix.
@@ -214,6 +216,7 @@ class SourceReader:
         self._arrays: dict[Path, dict[str, Array]] = {}
         self.units, self.joint_names = dict(spec.units), joint_names
         self.said: list[str] = []
+        self._of_q: Array = np.zeros(0)  # from the units of its columns to SI
         self.called: dict[str, str] = {}
 
     def source(self, signal: str) -> Path | None:
@@ -305,15 +308,21 @@ class SourceReader:
         """(k,) from the units of columns to SI."""
         known = {x.casefold(): x for x in UNITS[signal]} | _SPELLED
         factors = np.full(len(places), unit_factor(self.units, signal))
+        follows = signal in ("dq", "cmd") and signal not in self._spec.units
+        if follows and len(self._of_q) == len(places):
+            factors = self._of_q.copy()
         for k, i in enumerate(places if table.units and signal not in self._spec.units else ()):
             word = re.sub(r"(/|\s*per\s*)s(ec)?$|·?s\^?-1$|·?s⁻¹$", "", table.units[i])
             unit = known.get(word.casefold(), "")
             if unit in UNITS[signal]:
                 factors[k] = UNITS[signal][unit]
-                self.units.setdefault(signal, unit)
+                if unit not in SLIDING:  # those say nothing of the other columns
+                    self.units.setdefault(signal, unit)
             elif word:
                 usual = next(iter(UNITS[signal]))
                 self._say(f"{table.path}: {signal} in [{table.units[i]}] is taken as {usual}")
+        if signal == "q":
+            self._of_q = factors
         return factors
 
     def _in_arrays(self, path: Path, signal: str, told: bool) -> Array | None:

@@ -26,7 +26,7 @@ from drivers.interface import Array, DriverError
 _SEPARATORS = (";", "\t", "|", ",")
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # of a header: pos [deg] or time_ms, not q[0]
-_UNIT = re.compile(r"\s*[\[(]\s*([^\d\])][^\])]*)[\])]\s*$|_(ms|us|ns|deg|rad|mNm|Nm)$")
+_UNIT = re.compile(r"\s*[\[(]\s*([^\d\])][^\])]*)[\])]\s*$|_(ms|us|ns|deg|rad|mm|mNm|Nm)$")
 
 
 @dataclass(frozen=True, slots=True)

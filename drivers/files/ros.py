@@ -2,9 +2,9 @@
 
 Plain CDR of either byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes).
 Alignment counts from the byte behind the encapsulation header. Source: OMG DDS-XTypes 1.3, 7.4
-(encapsulation, plain CDR). Of three messages of joints only the beginning is read:
-control_msgs/DynamicJointState (ros-controls/control_msgs), franka_msgs/FrankaRobotState and
-franka_msgs/FrankaState (frankaemika/franka_ros2).
+(encapsulation, plain CDR). Of four messages of joints only the beginning is read:
+control_msgs/DynamicJointState and JointTrajectoryControllerState (ros-controls/control_msgs),
+franka_msgs/FrankaRobotState and FrankaState (frankaemika/franka_ros2).
 
 Decoding is split in two: a parser finds *where* the numbers of a message lie (`Layout`), then
 numpy reads them, from one message or from all messages whose other bytes are the same.
@@ -183,6 +183,22 @@ def parse_dynamic_joint_state(data: Bytes) -> Layout:
         starts = starts if len(starts) == len(names) else []
         doubles.append(np.add.outer(starts, np.arange(8)).ravel().astype(np.int64))
     return Layout(cursor.little, frame_id, tuple(names), tuple(doubles), tuple(runs))
+
+
+def parse_controller_state(data: Bytes) -> Layout:
+    """Layout of a JointTrajectoryControllerState: runs of its feedback, then reference positions.
+
+    All its versions begin so; the oldest call these two actual and desired. Raises CdrError.
+    """
+    cursor = _Cursor(data)
+    frame_id = cursor.text()
+    names = tuple(cursor.text() for _ in range(cursor.count()))
+    runs: list[slice] = []
+    for _ in ("reference", "feedback"):  # position, velocity, acceleration, effort and a duration
+        runs += (cursor.doubles(cursor.count()) for _ in range(4))
+        runs.append(cursor.stamp())
+    goal, _, _, _, _, position, velocity, _, effort, _ = runs
+    return Layout(cursor.little, frame_id, names, (position, velocity, effort, goal), tuple(runs))
 
 
 def parse_doubles(data: Bytes, number: int, of_child: bool = False) -> Layout:

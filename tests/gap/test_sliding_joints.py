@@ -13,6 +13,7 @@ import pinocchio as pin
 import pytest
 
 import adapter
+from adapter.cli import main
 from adapter.gap.load import find_load
 from adapter.gap.servo import going_on
 from adapter.gap.servo_kernels import Ground, over_ground
@@ -21,7 +22,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
 from adapter.physics.kernels import frames_of
 from adapter.signals.matching import present
-from drivers.files.mcap import Commands, Log
+from drivers.files.mcap import Commands, Log, write_log
 from tests.helpers.robot_models import machine_urdf, pin_model, read_quietly
 
 COULOMB_N, VISCOUS_N_S, LOAD_KG = 12.0, 25.0, 0.8
@@ -94,6 +95,29 @@ def test_the_hand_behind_a_rail_is_weighed() -> None:
     entry = next(e for e in same.model.effects if e["effect"] == "coulomb_friction")
     assert entry["joints"] == [1] and entry["units"]["Fc"] == "N"
     assert entry["parameters"]["Fc"] == pytest.approx(COULOMB_N, rel=0.1)
+
+
+def test_what_info_and_replay_say_of_a_rail(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, file, robot = recorded("rail")[1], tmp_path / "rail.mcap", tmp_path / "rail.urdf"
+    robot.write_text(machine_urdf("rail"))
+    nothing, arm = np.full_like(log.q, np.nan), ["--robot", str(robot)]
+    orders = Commands(log.stamp_ns, nothing, log.q + 0.01)
+    write_log(replace(log, dq=nothing, tau=nothing, commands=orders), file, {})
+    assert main(["info", str(file), *arm]) == 0
+    said = capsys.readouterr().out
+    assert "mrad (mm of j1)" in said and "positions rad (m of j1), no efforts" in said
+    write_log(log.piece(0, 2000), file, {})
+    assert main(["info", str(file), *arm]) == 0
+    said = capsys.readouterr().out
+    assert "(N of j1)" in said and "explain, N m (N of joint 1): " in said
+    main(["replay", str(file), *arm, "--validate-from", "6", "--out", str(tmp_path / "out")])
+    said = capsys.readouterr().out.replace("\u202f", " ")
+    assert re.search(r"joint 1 [\d.]+ N → [\d.]+ N\.", said)
+    assert re.search(r"N m\s+\(N of joint 1\)", said)
+    page = (tmp_path / "out" / "report.html").read_text().replace("\u202f", " ")
+    assert "N m (N of joint 1) rms" in page
 
 
 def test_fingers_in_a_recording_are_spoken_of_and_free_where_asked_for() -> None:

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat
+from rosbags.rosbag2 import CompressionFormat, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
 JOINTS = ("arm_joint1", "arm_joint2", "arm_joint3")
 _ROBOT_STATE = """std_msgs/Header header
 franka_msgs/CollisionIndicators collision_indicators
@@ -25,6 +26,10 @@ DEFINITIONS = {
     "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values\n",
     "control_msgs/msg/DynamicJointState": (
         "std_msgs/Header header\nstring[] joint_names\nInterfaceValue[] interface_values\n"
+    ),
+    "control_msgs/msg/JointJog": (
+        "std_msgs/Header header\nstring[] joint_names\nfloat64[] displacements\n"
+        "float64[] velocities\nfloat64 duration\n"
     ),
     "franka_msgs/msg/CollisionIndicators": f"{_COLLISION}float64[7] e\nfloat64[7] f\n",
     "franka_msgs/msg/FrankaRobotState": _ROBOT_STATE,
@@ -53,12 +58,13 @@ ROS2 = _store(Stores.ROS2_HUMBLE, DEFINITIONS)
 
 @dataclass(frozen=True)
 class Motion:
-    """Stamps (m,) ns and signals (m, n) of joints."""
+    """Stamps (m,) ns and signals (m, n) of joints; a controller's goals, and efforts if numbers."""
 
     stamp_ns: np.ndarray
     q: np.ndarray
     dq: np.ndarray
     tau: np.ndarray
+    goal: np.ndarray | None = None
 
     @classmethod
     def of(cls, joints=3, samples=60, period_ns=10_000_000, seed=1):
@@ -73,8 +79,9 @@ class Motion:
 
 def _header(store, stamp_ns, seq):
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), 10**9))
-    more = {"seq": seq} if store is ROS1 else {}
-    return store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="base", **more)
+    kind = store.types["std_msgs/msg/Header"]
+    more = {"seq": seq} if "seq" in kind.__dataclass_fields__ else {}
+    return kind(stamp=stamp, frame_id="base", **more)
 
 
 def joint_state(store, header, names, q, dq, tau):
@@ -97,6 +104,16 @@ def message(store, kind, names, motion, i):
         ]
         sensor = value(["force.x"], np.array([1.0 * i]))
         return make(header, ["wrist_sensor", *names], [sensor, *rows])
+    if kind == CONTROLLER_STATE:
+        point = store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+        after, none = store.types["builtin_interfaces/msg/Duration"], np.zeros(0)
+        # some references have accelerations, and all come at times of their own
+        reference = point(motion.goal[i], dq, none if i % 3 else dq, none, after(i, 7 * i))
+        feedback = point(q, dq, none, none if np.isnan(tau).all() else tau, after(0, 0))
+        rest = [point(none, none, none, none, after(0, 0))] * (len(store.fielddefs[kind][1]) - 4)
+        return make(header, list(names), reference, feedback, *rest)
+    if kind == "control_msgs/msg/JointJog":
+        return make(header, list(names), np.zeros(0), dq, 0.1)
     if kind == "franka_msgs/msg/FrankaRobotState":
         corner = store.types["geometry_msgs/msg/Vector3"](i, 0.0, 0.0)
         flags = store.types["franka_msgs/msg/CollisionIndicators"](*[corner] * 4, filler, filler)
@@ -154,3 +171,17 @@ def _fill(writer, store, topics, names, serialize):
         for i, stamp_ns in enumerate(motion.stamp_ns):
             raw = serialize(message(store, kind, names, motion, i), kind)
             writer.write(connection, int(stamp_ns), raw)
+
+
+def write_controller_states(path, points, motion, topics=("/arm/state",)):
+    """A bag of the kind that the path ends with; `points` are what the message calls its own."""
+    ros1, kind = path.suffix == ".bag", CONTROLLER_STATE
+    text = "std_msgs/Header header\nstring[] joint_names\n"
+    text += "".join(f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in points)
+    store = _store(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE, {kind: text})
+    storage = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    writer = Ros1Writer(path) if ros1 else Ros2Writer(path, version=9, storage_plugin=storage)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    with writer:
+        _fill(writer, store, dict.fromkeys(topics, (kind, motion)), JOINTS, serialize)
+    return path

@@ -18,8 +18,12 @@ from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
 from adapter.model.urdf import model_from_urdf
 from adapter.physics.rigid_arm import RigidArm
-from tests.helpers.robot_models import ROBOTS, read_quietly, relative, urdf_text
+from adapter.signals.matching import matching, present
+from drivers.files.mcap import Log
+from tests.helpers.robot_models import ROBOTS, machine_urdf, read_quietly, relative, urdf_text
 
+FIRST, SECOND = "panda_finger_joint1", "panda_finger_joint2"
+RULE = ' multiplier="-0.5" offset="0.3"'
 FINGERS = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
 
 
@@ -84,23 +88,54 @@ def test_a_locked_model_is_written_onto_its_whole_file(value: float) -> None:
     np.testing.assert_allclose(again.theta, whole.theta, atol=1e-12)
 
 
-def test_fingers_are_where_they_are_told_to_be() -> None:
-    """A sliding finger, and one that follows it."""
-    text = FINGERS.read_text().replace(
-        '<joint name="panda_finger_joint2" type="prismatic">',
-        '<joint name="panda_finger_joint2" type="prismatic"><mimic joint="panda_finger_joint1"/>',
-    )
-    oracle = pin.buildModelFromXML(text)
-    with pytest.warns(ModelWarning, match="finger_joint2. is prismatic and mimics.* at 0.04"):
-        model = model_from_urdf(text, lock={"panda_finger_joint1": 0.04})
-    rng = np.random.default_rng(3)
-    q, dq, ddq = rng.uniform(-1, 1, (3, 7))
-    rest = np.zeros(oracle.nv - 7)
-    tau = pin.rnea(
-        oracle, oracle.createData(), np.r_[q, rest + 0.04], np.r_[dq, rest], np.r_[ddq, rest]
-    )
-    ours = RigidArm.of(model).torque(q[None], dq[None], ddq[None])[0]
-    assert relative(ours, tau[:7]) < 1e-9
+def following(text: str, joint: str, leader: str, rule: str = "") -> str:
+    """A URDF in which a joint that slides mimics another."""
+    tag = f'<joint name="{joint}" type="prismatic">'
+    return text.replace(tag, f'{tag}<mimic joint="{leader}"{rule}/>')
+
+
+@pytest.mark.parametrize(("rule", "factor", "offset"), [("", 1.0, 0.0), (RULE, -0.5, 0.3)])
+@pytest.mark.parametrize("lock", [{FIRST: 0.04}, {}])
+def test_fingers_are_where_they_are_told_to_be(
+    rule: str, factor: float, offset: float, lock: dict[str, float]
+) -> None:
+    """A sliding finger, and one that follows it: where it is at its leader's zero if that moves."""
+    text = following(FINGERS.read_text(), SECOND, FIRST, rule)
+    oracle, arm = pin.buildModelFromXML(text), [f"panda_joint{k}" for k in range(1, 8)]
+    first = lock.get(FIRST, 0.0)
+    second = round(factor * first + offset, 9)
+    said = f"mimics {FIRST}.* at {second or 'zero'}"
+    with pytest.warns(ModelWarning, match=said):
+        model = model_from_urdf(text, joints=None if lock else [*arm, FIRST], lock=lock)
+    q, dq, ddq = np.random.default_rng(3).uniform(-1, 1, (3, 7))
+    at = np.r_[q, first, second], np.r_[dq, 0.0, 0.0], np.r_[ddq, 0.0, 0.0]
+    tau = pin.rnea(oracle, oracle.createData(), *at)[: model.tree.n]
+    ours = RigidArm.of(model).torque(*(x[None, : model.tree.n] for x in at))[0]
+    assert relative(ours, tau) < 1e-9
+
+
+def test_a_column_of_a_joint_that_follows_is_not_needed_and_checked() -> None:
+    with pytest.warns(ModelWarning):
+        model = model_from_urdf(following(FINGERS.read_text(), SECOND, FIRST, RULE))
+    model = loads(dumps(model))
+    names = (*model.tree.joint_names, FIRST, SECOND)
+    q = 0.02 * np.sin(np.linspace(0, 9, 900)[:, None] + np.arange(9))
+    q[:, 8] = -0.5 * q[:, 7] + 0.3
+    log = Log(Path("a.mcap"), names, 10**7 * np.arange(900), q, 0 * q, 0 * q)
+    told = [*matching(log, model).warnings, *present(model, names, "a.mcap")[1]]
+    assert not [x for x in told if SECOND in x and "ignored" not in x]
+    assert [x for x in told if FIRST in x and "holds still" in x]
+    q[:, 8] += 0.01
+    (said,) = (x for x in matching(log, model).warnings if "rms" in x)
+    assert f"{SECOND} is 0.01 m (rms) off -0.5 times {FIRST} plus 0.3" in said
+    without = matching(log.select(names[:8]), model)
+    assert without.joint_names == names[:7] and "rms" not in "".join(without.warnings)
+
+
+def test_what_rides_on_a_joint_that_follows_is_said() -> None:
+    text = following(machine_urdf("gantry"), "j2", "j1")
+    with pytest.warns(ModelWarning, match="j2.*in its leader, and j3, j4 behind it will not be"):
+        model_from_urdf(text)
 
 
 def test_effects_keep_their_joints() -> None:

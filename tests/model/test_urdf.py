@@ -102,8 +102,6 @@ def test_pybullets_panda_has_its_fingers_locked() -> None:
     assert model.tree.joint_names == tuple(f"panda_joint{k}" for k in range(1, 8))
     assert model.theta[6, 0] == pytest.approx(0.2 + 0.81 + 0.1 + 0.1)
     asked = [*model.tree.joint_names, "panda_finger_joint1"]
-    with pytest.warns(ModelWarning, match="mimics panda_finger_joint1, which moves"):
-        read_urdf(path, joints=asked)
     with pytest.warns(ModelWarning, match="made up"):
         free = read_urdf(path, joints=asked, lock={"panda_finger_joint2": 0.01})
     assert free.tree.joint_names == tuple(asked) and free.tree.slides == (*7 * (False,), True)

@@ -2,14 +2,15 @@
 
 import gzip
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
-from drivers.files.mcap import McapWriter, read_log, read_position_log
-from tests.helpers.bags import Motion, write_ros2
+from drivers.files.mcap import read_log, read_position_log
+from tests.helpers.bags import JOINTS, Motion, write_controller_states, write_ros2
 
 TIME = np.arange(500) * 0.02
 Q = 0.5 * np.sin(2.0 * TIME[:, None] + [0.0, 1.0])
@@ -94,7 +95,36 @@ def test_a_data_set_there_and_back(tmp_path, capsys):
     info = json.loads((tmp_path / "one" / "meta" / "info.json").read_text())
     assert (info["fps"], info["total_frames"]) == (50, len(TIME))
     assert set(info["features"]) == set(first.column_names)
+    told = json.loads((tmp_path / "one" / "meta" / "stats.json").read_text())
+    episode = pq.read_table(tmp_path / "one" / "meta" / "episodes").to_pylist()[0]
+    for name, numbers in told.items():
+        values = np.array(first[name].to_pylist()).reshape(len(TIME), -1)
+        for percent in (1, 10, 50, 90, 99):
+            found = numbers[f"q{percent:02}"]
+            assert np.allclose(found, np.quantile(values, percent / 100, axis=0), atol=1e-6)
+        assert numbers == {key: episode[f"stats/{name}/{key}"] for key in numbers}
     assert main(["export", str(tmp_path / "out.mcap"), *out]) == ExitCode.WRONG_USE
+
+
+def test_what_lerobot_itself_reads_and_appends_to(tmp_path):
+    reason = "the package lerobot is not installed"
+    loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason=reason).LeRobotDataset
+    states = table(tmp_path / "s.csv", TIME, Q, CMD, header="t;q_1;q_2;cmd_1;cmd_2")
+    imported(tmp_path, states)
+    folder = tmp_path / "set"
+    assert main(["export", str(tmp_path / "out.mcap"), "--lerobot", str(folder)]) == 0
+    read = loader("nobody/set", root=folder)
+    rows = [read[i] for i in range(len(read))]
+    for name, values in (("observation.state", Q), ("action", CMD), ("timestamp", TIME)):
+        assert np.allclose([row[name].numpy() for row in rows], values, atol=1e-6)
+    assert (read.fps, rows[-1]["task"]) == (50, "motion")
+    for q, goal in np.stack([Q, CMD], axis=1)[:30].astype(np.float32):
+        read.add_frame({"observation.state": q, "action": goal, "task": "more"})
+    read.save_episode()
+    read.finalize()
+    again = loader("nobody/set", root=folder)
+    assert (again.num_episodes, len(again), again[len(TIME)]["task"]) == (2, len(TIME) + 30, "more")
+    assert_commanded(imported(tmp_path, folder, "--episode", "1"), Q[:30], CMD[:30], TIME[:30])
 
 
 def sage(folder, joints):
@@ -124,15 +154,6 @@ def test_a_folder_of_sage_and_what_is_said_of_it(tmp_path, capsys):
         for words in ("500 commanded positions", "rms: 30  50 mrad", "no efforts", "the servos"):
             assert words in said
         assert "problem" not in said and "adapter gap LOG --robot" in said
-
-
-def test_efforts_of_zero_are_none(tmp_path, capsys):
-    with McapWriter(tmp_path / "a.mcap", ("a", "b")) as writer:
-        for k in range(len(TIME)):
-            writer.write_joint_state(k * 20_000_000, Q[k], 0 * Q[k], 0 * Q[k])
-            writer.write_position_command(k * 20_000_000, CMD[k])
-    assert main(["info", str(tmp_path / "a.mcap")]) == 0
-    assert "rms: 30  50 mrad" in capsys.readouterr().out
 
 
 def test_names_of_joints(tmp_path, capsys):
@@ -177,6 +198,18 @@ def test_headers_that_say_their_units(tmp_path, code, point):
         assert np.array_equal(log.stamp_ns, np.round(TIME * 1e9))
 
 
+def test_a_rail_beside_joints_that_turn(tmp_path, capsys):
+    header = "t;E1 pos [mm];A1 pos [deg];E1 vel [mm/s];A1 vel [deg/s];E1 torque [N];A1 torque [Nm]"
+    rail, turn = Q.T
+    columns = (TIME, 1e3 * rail, np.degrees(turn), 1e3 * TAU[:, 0], np.degrees(TAU[:, 1]))
+    log = imported(tmp_path, table(tmp_path / "a.csv", *columns, TAU, header=header))
+    for told, said in ((log.q, Q), (log.dq, TAU), (log.tau, TAU)):
+        assert np.allclose(told, said)
+    bare = header.replace(" [mm/s]", "").replace(" [deg/s]", "")
+    table(tmp_path / "a.csv", *columns[:3], *columns[1:3], TAU, header=bare)
+    assert np.allclose(imported(tmp_path, tmp_path / "a.csv").dq, Q)
+
+
 def test_texts_and_blanks_that_nobody_asked_for(tmp_path, capsys):
     words, where = np.full(len(TIME), "ok"), ("--columns", "q=1:3,tau=3:5")
     path = table(tmp_path / "a.csv", words, Q, TAU, np.full(len(TIME), ""))
@@ -186,3 +219,56 @@ def test_texts_and_blanks_that_nobody_asked_for(tmp_path, capsys):
     with pytest.raises(SystemExit):
         refusal(capsys, path, "--rate", "0")
     assert "no rate in Hz" in capsys.readouterr().err
+
+
+def silent(ahead):
+    """A motion without efforts, and what is commanded so far ahead of it."""
+    motion = Motion.of(samples=200)
+    return replace(motion, tau=np.full_like(motion.tau, np.nan), goal=motion.q + ahead)
+
+
+NEW = ("reference", "feedback", "error", "output")
+OLD = ("desired", "actual", "error")
+
+
+@pytest.mark.parametrize("points", [NEW, OLD, (*NEW, "desired", "actual")])
+@pytest.mark.parametrize("name", ["sqlite", "a.mcap", "a.bag"])
+def test_the_state_of_a_controller_is_commands_and_positions(tmp_path, capsys, points, name):
+    motion = silent(np.array([0.03, -0.05, 0.01]))
+    bag = write_controller_states(tmp_path / name, points, motion)
+    log = read_position_log(bag)
+    assert log.joint_names == JOINTS and np.array_equal(log.stamp_ns, motion.stamp_ns)
+    for read in (log, imported(tmp_path, bag)):
+        assert_commanded(read, motion.q, motion.goal, 1e-9 * motion.stamp_ns)
+    said, some = capsys.readouterr().err, [2, 0]
+    other = imported(tmp_path, bag, "--units", "q=deg", "--joints", "arm_joint3,arm_joint1")
+    seconds, (q, goal) = 1e-9 * motion.stamp_ns, np.radians([motion.q, motion.goal])
+    assert_commanded(other, q[:, some], goal[:, some], seconds)
+    assert "positions and commands are feedback and reference of /arm/state" in said
+    assert main(["info", str(bag)]) == 0
+    said = capsys.readouterr().out
+    assert "200 commanded positions" in said and "rms: 30  50  10 mrad" in said
+
+
+def test_which_topics_tell_commands(tmp_path, capsys):
+    motion = silent(0.1)
+    orders, seconds = replace(motion, q=motion.goal), 1e-9 * motion.stamp_ns
+    dynamic, jog = "control_msgs/msg/DynamicJointState", "control_msgs/msg/JointJog"
+    states = "sensor_msgs/msg/JointState", replace(motion, tau=np.zeros_like(motion.q))
+    usual = {"/joint_states": states, "/joint_commands": (states[0], orders)}
+    assert main(["info", str(write_ros2(tmp_path / "zero", usual))]) == 0
+    assert "rms: 100  100  100 mrad" in capsys.readouterr().out
+    topics = {"/dynamic_joint_states": (dynamic, motion), "/servo/delta": (jog, motion)}
+    told = write_ros2(tmp_path / "a", {**topics, "/joint_commands": (dynamic, orders)})
+    assert_commanded(imported(tmp_path, told), motion.q, motion.goal, seconds)
+    said = capsys.readouterr().err
+    assert "those of /dynamic_joint_states" in said and "/servo/delta jogs: steps and" in said
+    alone = write_ros2(tmp_path / "b", topics)
+    assert "/dynamic_joint_states has efforts that are not a number" in refusal(capsys, alone)
+    assert main(["info", str(alone)]) == 0 and "/servo/delta jogs" in capsys.readouterr().out
+    two = write_controller_states(tmp_path / "c", NEW, motion, ("/left", "/right"))
+    assert "2 topics tell positions and commands: /left, /right; choose" in refusal(capsys, two)
+    assert main(["info", str(two)]) == 0 and "/left, /right; choose" in capsys.readouterr().out
+    assert_commanded(read_position_log(two, "/right"), motion.q, motion.goal, seconds)
+    strong = write_controller_states(tmp_path / "d", OLD, replace(motion, tau=motion.q))
+    assert read_position_log(strong) is None and np.array_equal(read_log(strong).tau, motion.q)

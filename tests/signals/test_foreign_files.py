@@ -168,7 +168,6 @@ def bag_makers():
     yield "nan", "not a number throughout", write_ros2, {"/s": (JOINT_STATE, still)}, names
     yield "no [bold]names%20?#'.bag", "names joints", write_ros1, topics, ()
     yield "twice", "names joints", write_ros2, topics, ("a", "a")
-    yield "dynamic", READ, write_ros2, {"/d": ("control_msgs/msg/DynamicJointState", MOTION)}, names
 
 
 @pytest.mark.parametrize("maker", list(bag_makers()), ids=lambda maker: maker[0])

@@ -59,12 +59,6 @@ def test_columns_by_name_and_pattern(tmp_path):
     assert_same(log)
 
 
-@pytest.mark.parametrize("header", ["t,q1,q2,dq1,dq2,tau1,tau2", "# t,q1,q2,dq1,dq2,tau1,tau2"])
-def test_usual_names_need_no_map(tmp_path, header):
-    log, _ = run(tmp_path, [write(tmp_path / "t.csv", TABLE, header=header)])
-    assert_same(log)
-
-
 @pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_units(tmp_path, unit, scale):
     factors = np.array([scale] + 4 * [180 / np.pi] + 2 * [1e3])

@@ -9,7 +9,7 @@ import pytest
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
 from adapter.signals.importer import velocity_doubts
-from drivers.files.mcap import McapWriter, read_log, read_position_log
+from drivers.files.mcap import McapWriter, read_log
 from drivers.files.mcap.records import McapScan
 from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros1_mcap, write_ros2
 from tests.helpers.mcap_tools import record, samples
@@ -97,7 +97,7 @@ def test_units(tmp_path, capsys):
     as_it_is = imported(bag, "--units", "q=rad,dq=deg", "--overwrite")
     assert np.array_equal(read_log(as_it_is).q, told.q)
     assert np.allclose(read_log(as_it_is).dq, 5 * MOTION.dq, rtol=1e-14)
-    said = "no unit 'grad' for q; have: rad, deg; did you mean rad?"
+    said = "no unit 'grad' for q; have: rad, deg, m, mm; did you mean rad?"
     assert said in refused(capsys, bag, "--units", "q=grad")
     assert main(["info", str(bag), "--units", "q=deg"]) == 0
     assert "positions rad" in capsys.readouterr().out
@@ -152,9 +152,6 @@ def test_what_goes_with_tables_only_is_refused(tmp_path, capsys):
 
 
 def test_what_cannot_be_a_recording_is_refused(tmp_path, capsys):
-    still = Motion(MOTION.stamp_ns, MOTION.q, MOTION.dq, np.full_like(MOTION.tau, np.nan))
-    bag = write_ros2(tmp_path / "bag", {"/joint_states": (JOINT_STATE, still)})
-    assert "not a number throughout" in refused(capsys, bag)
     cut = write_ros1(tmp_path / "cut.bag", STATES)
     cut.write_bytes(cut.read_bytes()[:3000])
     assert "cut.bag: is a damaged or unfinished bag" in refused(capsys, cut)
@@ -195,17 +192,3 @@ def test_commands_and_links_come_along(tmp_path):
     commands = read_log(imported(asked, "--overwrite", "--units", "tau=mNm")).commands
     assert np.array_equal(commands.stamp_ns, 10**9 + np.arange(20) * 10**7 + 5)
     assert np.allclose(commands.tau, np.column_stack([np.full(20, 0.5), 2e-3 * np.arange(20)]))
-
-
-def test_an_arm_that_takes_positions(tmp_path):
-    source = tmp_path / "servos.mcap"
-    with McapWriter(source, ("a", "b")) as writer:
-        for i in range(50):
-            writer.write_position(10**9 + i * 10**7, np.array([i, -i]))
-            writer.write_position_command(10**9 + i * 10**7 + 3, np.array([i + 1.0, 0.0]))
-    log = read_position_log(imported(source, "--units", "q=deg", "--joints", "b,a"))
-    assert log.joint_names == ("b", "a")
-    turned = np.radians(np.column_stack([-np.arange(50.0), np.arange(50.0)]))
-    assert np.allclose(log.q, turned)
-    assert np.array_equal(log.commands.stamp_ns, 10**9 + np.arange(50) * 10**7 + 3)
-    assert np.allclose(log.commands.q[:, 1], np.radians(np.arange(50) + 1.0))

@@ -22,8 +22,12 @@ from drivers.interface import Array, DriverError
 
 _IN_MEMORY = 2**20  # bytes of a column that stay in memory
 _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
-_NEED = "learning needs positions and measured joint torques (effort)"
-Q, DQ, TAU = range(3)  # runs of doubles in a message
+_NEED = (
+    "learning needs positions and measured joint torques (effort); of positions with commanded "
+    "ones beside them `adapter gap` tells the servos"
+)
+Q, DQ, TAU, GOAL = range(4)  # runs of doubles in a message; few kinds have the last one
+_CALLED = {Q: "position", TAU: "effort", GOAL: "reference"}
 _CLOCKS = attrgetter("stamp_ns"), attrgetter("log_ns")  # of a block
 _PLACE = attrgetter("index")
 _Stamps = NDArray[np.int64]
@@ -88,19 +92,18 @@ def _is_of_joints(series: Series) -> bool:
     return series.encoding == "cdr" and series.schema in JOINT_SCHEMAS
 
 
-def fits(series: Series, effort: bool) -> bool:
-    """Whether a topic tells positions (and efforts) of joints."""
-    needed = (Q, TAU) if effort else (Q,)
+def fits(series: Series, *needed: int) -> bool:
+    """Whether a topic tells these runs of joints."""
     return _is_of_joints(series) and any(
-        names and all(lengths[run] == len(names) for run in needed)
+        names and all(lengths[run : run + 1] == (len(names),) for run in needed)
         for names, lengths in series.kinds
     )
 
 
 def _run(block: Block, run: int) -> Array | None:
     """A run of doubles with one value for each joint; None where it is absent."""
-    values = block.values[run]
-    return values if values.shape[1] == len(block.layout.names) else None
+    values = block.values[run] if run < len(block.values) else None
+    return values if values is not None and values.shape[1] == len(block.layout.names) else None
 
 
 class JointRows:
@@ -120,7 +123,7 @@ class JointRows:
         self.place = stamps_file()
         self.runs = {run: RowsFile(len(names), _IN_MEMORY) for run in kept}
         self.present: set[int] = set()
-        self.lengths: dict[int, set[int]] = {Q: set(), DQ: set(), TAU: set()}
+        self.lengths: dict[int, set[int]] = {Q: set(), DQ: set(), TAU: set(), GOAL: set()}
 
     def __len__(self) -> int:
         return len(self.place)
@@ -132,8 +135,8 @@ class JointRows:
             self.messages += len(block.index)
             runs = {run for run in self.lengths if _run(block, run) is not None}
             self.present |= runs
-            for run, lengths in self.lengths.items():
-                lengths.add(block.values[run].shape[1])
+            for run, values in enumerate(block.values):
+                self.lengths[run].add(values.shape[1])
             if runs >= set(needed):
                 kept.append(block)
         if not kept:
@@ -211,12 +214,11 @@ class Told:
             )
         own = sets[chosen]
         need = _NEED if TAU in self._needed else "discovery needs the positions of the joints"
-        what_of = {Q: "position", TAU: "effort"}
         for run in self._needed:
             if run not in own.present:
                 lengths = ", ".join(map(str, sorted(own.lengths[run])))
                 raise DriverError(
-                    f"{where} has no {what_of[run]} ({lengths} values for "
+                    f"{where} has no {_CALLED[run]} ({lengths} values for "
                     f"{len(own.names)} joints); {need}"
                 )
         if not len(own):
@@ -224,7 +226,7 @@ class Told:
         if len(own) < own.messages:
             warnings.append(
                 f"{where}: {own.messages - len(own)} messages lack "
-                f"{' or '.join(what_of[run] for run in self._needed)}; left out"
+                f"{' or '.join(_CALLED[run] for run in self._needed)}; left out"
             )
         return own
 

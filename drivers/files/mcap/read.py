@@ -15,6 +15,7 @@ from drivers.files.bounded import parse_json
 from drivers.files.estimates import estimate_values
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.joints import (
+    GOAL,
     TAU,
     Q,
     Told,
@@ -154,10 +155,14 @@ def assembled(
 
 
 def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
-    """The positions of a recording whose `/joint_commands` hold positions, without any efforts.
+    """The positions of a recording that tells commanded ones beside them, without any efforts.
+
+    Commands are those on `/joint_commands`, or the references in the state of a controller of
+    trajectories, which has the positions with them.
 
     Args:
-        path: as `read_log` takes it; topic: of the joint states, `/joint_states` where None.
+        path: as `read_log` takes it; topic: of the joint states. Where None `/joint_states`, else
+            the only one that tells positions (and references, if there are no other commands).
 
     Returns:
         Finite positions, stamps of the encoders and of the commands strictly increasing; None for
@@ -165,24 +170,25 @@ def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
         positions.
 
     Raises:
-        DriverError: the file is unreadable, or positions and commands are of other joints.
+        DriverError: the file is unreadable, positions and commands are of other joints, or several
+            controllers tell both.
     """
-    states, glance = topic or JOINT_STATES, open_scan(Path(path))
+    glance = open_scan(Path(path))
     glance.within_s = (0.0, GLANCE_S)  # a long recording is not held in memory for that
-    topics = collect(glance, lambda series: series.topic == states)
-    if states not in topics or JOINT_COMMANDS not in topics or not topics[JOINT_COMMANDS].count:
+    pair = _commanded(glance, topic)
+    if pair is None:
         return None
-    if fits(topics[states], effort=True) and _has_effort(topics[states]):
-        return None
-    scan = open_scan(Path(path))
-    topics = collect(scan, lambda series: series.topic in (states, JOINT_COMMANDS))
-    read, commanded = topics.get(states), topics.get(JOINT_COMMANDS)
-    if read is None or commanded is None or not fits(commanded, effort=False):
-        return None
-    if not fits(read, effort=False) or _has_effort(read):
+    (states, ordering), scan = pair, open_scan(Path(path))
+    topics = collect(scan, lambda series: series.topic in pair)
+    read, commanded = topics[states], topics[ordering]
+    asked = GOAL if read is commanded else Q
+    if not fits(read, Q) or _has_effort(read) or not fits(commanded, asked):
         return None
     names, at, rows, said = _positions(read, scan.path, None)
-    _, when, commands, _ = _positions(commanded, scan.path, names)
+    _, when, commands, _ = _positions(commanded, scan.path, names, asked)
+    if topic is None and states != JOINT_STATES:
+        both = "s are those" if asked == Q else "s and commands are feedback and reference"
+        said.append(f"{scan.path}: position{both} of {states}")
     nothing, warnings = np.full_like(rows, np.nan), scan.warnings + said
     orders = Commands(when, np.full_like(commands, np.nan), commands)
     return Log(
@@ -201,18 +207,40 @@ def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
     )
 
 
+def _commanded(scan: Scan, topic: str | None) -> tuple[str, str] | None:
+    """The topics of positions and of commanded ones, see `read_position_log`."""
+    topics = collect(scan, lambda series: series.schema in JOINT_SCHEMAS)
+    orders = topics.pop(JOINT_COMMANDS, None)
+    usual = topics.get(topic or JOINT_STATES)
+    told = [*topics.values()] if topic is None else [usual] if usual is not None else []
+    if usual is not None and fits(usual, Q, TAU) and _has_effort(usual):
+        return None
+    alone = [x for x in told if x is usual or (usual is None and fits(x, Q))]
+    if orders is not None and orders.count and len(alone) == 1:
+        return alone[0].topic, JOINT_COMMANDS
+    both = sorted(x.topic for x in told if fits(x, Q, GOAL))
+    if not both or any(map(_has_effort, told)):
+        return None
+    if len(both) > 1:
+        raise DriverError(
+            f"{scan.path}: {len(both)} topics tell positions and commands: {', '.join(both)}; "
+            "choose one (--topic NAME)"
+        )
+    return both[0], both[0]
+
+
 def _positions(
-    series: Series, path: Path, want: Sequence[str] | None
+    series: Series, path: Path, want: Sequence[str] | None, run: int = Q
 ) -> tuple[tuple[str, ...], NDArray[np.int64], Array, list[str]]:
     """Joints of a topic, finite positions (k, n) in the order of time, and sentences on its clock.
 
     With stamps (k,), of each of which it is the first; of `want` in that order where it is given.
     """
-    told, where, said = Told((Q,), (Q,)), f"{path}: {series.topic}", list[str]()
+    told, where, said = Told((run,), (run,)), f"{path}: {series.topic}", list[str]()
     told.take(series)
     rows = told.chosen(series, where, want, [])
     stamp_ns = in_use(*rows.clocks, where, said).table(False)[:, 0]
-    q = rows.runs[Q].table(False)[:, [rows.names.index(name) for name in want or rows.names]]
+    q = rows.runs[run].table(False)[:, [rows.names.index(name) for name in want or rows.names]]
     finite = np.isfinite(q).all(axis=1)
     found, first = np.unique(stamp_ns[finite], return_index=True)
     return rows.names, found, np.ascontiguousarray(q[finite][first]), said
@@ -271,7 +299,8 @@ def _choose_topic(
     series = topics.get(topic or JOINT_STATES)
     fitting = []
     if topic is None:
-        fitting = sorted(k for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, effort))
+        needed = (Q, TAU) if effort else (Q,)
+        fitting = sorted(k for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, *needed))
     if series is not None and JOINT_STATES in fitting:
         others = [name for name in fitting if name != JOINT_STATES]
         if others:
@@ -288,6 +317,9 @@ def _choose_topic(
     if fitting:
         scan.warnings.append(f"{scan.path}: joint states are those of {fitting[0]}")
         return topics[fitting[0]]
+    silent = [s for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, Q)]
+    if series is None and topic is None and len(silent) == 1:
+        return silent[0]  # which lacks efforts, and that is what is said
     if series is None or not series.count:
         raise DriverError(_nothing_found(scan, topics, topic or JOINT_STATES))
     return series

@@ -20,6 +20,7 @@ from drivers.files.ros import (
     Bytes,
     Layout,
     decode_many,
+    parse_controller_state,
     parse_doubles,
     parse_dynamic_joint_state,
     parse_franka_robot_state,
@@ -32,7 +33,9 @@ from drivers.files.ros_types import (
     FRANKA_ROBOT_STATE,
     FRANKA_STATE,
     IMU,
+    JOINT_JOG,
     JOINT_STATE,
+    JOINT_TRAJECTORY_CONTROLLER_STATE,
     ODOMETRY,
     TWIST_STAMPED,
 )
@@ -41,6 +44,7 @@ from drivers.interface import DriverError
 _JOINT_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
     JOINT_STATE: parse_joint_state,
     DYNAMIC_JOINT_STATE: parse_dynamic_joint_state,
+    JOINT_TRAJECTORY_CONTROLLER_STATE: parse_controller_state,
     FRANKA_ROBOT_STATE: parse_franka_robot_state,
     FRANKA_STATE: parse_franka_state,
 }
@@ -172,6 +176,13 @@ def collect(
         _series(topics, scan, channel)
     for topic, count in scan.passed.items():
         topics[topic].count += count
+    for series in topics.values():
+        if series.schema == JOINT_JOG and series.count:
+            scan.warnings.append(
+                f"{scan.path}: {series.topic} jogs: steps and speeds from wherever a joint is tell "
+                "which joints were asked to move, and not where to; record the positions that are "
+                "made of them, too (/joint_commands, or the controller's state)"
+            )
     return topics
 
 
