@@ -106,6 +106,9 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     add("--lerobot", type=Path, metavar="FOLDER", help="of LOG: a data set, version 3, to write")
     add("--urdf", type=Path, metavar="FILE", help="to write")
     add("--mjcf", type=Path, metavar="FILE", help="to write")
+    said = "models drawn from what is known of MODEL; --urdf and --mjcf name a folder: 0000.urdf"
+    add("--samples", type=int, metavar="N", help=said)
+    add("--seed", type=int, default=0, help="of the samples")
     onto = parser.add_mutually_exclusive_group()
     onto.add_argument(
         "--onto",
@@ -124,6 +127,8 @@ def _check_export(args: argparse.Namespace) -> None:
         if args.urdf or args.mjcf or args.onto or args.alone or args.servo:
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
+    if args.samples is not None and (args.servo is not None or args.samples < 1):
+        raise UsageError("--samples N (1 or more) are drawn from a learned model, not of --servo")
     if args.servo is not None:
         options.check_robot(str(args.model))
     elif args.model.suffix != ".json":
@@ -134,6 +139,8 @@ def _check_export(args: argparse.Namespace) -> None:
     elif args.onto.suffix not in (".urdf", ".xml"):
         raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
     elif args.urdf is None and args.mjcf is None:
+        if args.samples is not None:
+            raise UsageError("--samples need a folder: --urdf FOLDER, --mjcf FOLDER")
         path = args.onto.with_suffix(f".learned{args.onto.suffix}")
         args.urdf, args.mjcf = (path, None) if path.suffix == ".urdf" else (None, path)
     elif (args.urdf if args.onto.suffix == ".urdf" else args.mjcf) is None:

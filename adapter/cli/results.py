@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
-from adapter.effects.active import check_effects
+from adapter.effects.active import check_effects, with_bodies
 from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
@@ -34,6 +34,8 @@ from adapter.runs.score import Reference, counted_from
 from adapter.runs.terminal import json_ready, output, program_version, show, warn, write_json
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.lerobot import write_lerobot
+
+SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml"}
 
 
 class Learned(NamedTuple):
@@ -173,10 +175,17 @@ def write_urdf(model: SelfModel, path: Path, whose: str = "", told: bool = False
 def write_robot(path: Path, written: RobotText) -> None:
     """Write a robot's file; warns of what it lacks."""
     path.write_bytes(written.text.encode())
+    warn(shortcomings(path, written))
+
+
+def shortcomings(path: Path, written: RobotText) -> list[str]:
+    """What a robot's file lacks, and what else is to be said of it."""
+    said = [f"{path}: {note}" for note in written.notes]
     if written.onto is None and written.left_out:
         listed = ", ".join(written.left_out)
-        warn([f"{path} has no full place for {listed}; a comment in it lists what is missing"])
-    warn([f"{path}: {note}" for note in written.notes])
+        lacking = f"{path} has no full place for {listed}; a comment in it lists what is missing"
+        said.insert(0, lacking)
+    return said
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -200,8 +209,16 @@ def run_export(args: argparse.Namespace) -> int:
         if path is None:
             continue
         fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")
-        written = text_of(model, onto=args.onto if fits else None, alone=args.alone)
-        write_robot(path, written)
+        write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
+        written = write(model)
+        if args.samples is None:
+            write_robot(path, written)
+        else:
+            path.mkdir(parents=True, exist_ok=True)
+            for number, drawn in enumerate(with_bodies(model).sample(args.samples, args.seed)):
+                file = path / f"{number:04d}{SUFFIXES[kind]}"
+                file.write_bytes(write(drawn).text.encode())
+            warn(shortcomings(path, written))
         facts[kind] = str(path)
         facts["onto"] = facts.get("onto") or written.onto
         facts["left_out"] = sorted({*facts.get("left_out", ()), *written.left_out})
