@@ -109,6 +109,8 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     said = "models drawn from what is known of MODEL; --urdf and --mjcf name a folder: 0000.urdf"
     add("--samples", type=int, metavar="N", help=said)
     add("--seed", type=int, default=0, help="of the samples")
+    said = "means, standard deviations, and the directions that make torques unsure, JSON to write"
+    add("--ranges", type=Path, metavar="FILE", help=said)
     onto = parser.add_mutually_exclusive_group()
     onto.add_argument(
         "--onto",
@@ -124,7 +126,7 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 def _check_export(args: argparse.Namespace) -> None:
     if args.lerobot is not None:
-        if args.urdf or args.mjcf or args.onto or args.alone or args.servo:
+        if any((args.urdf, args.mjcf, args.onto, args.alone, args.servo, args.ranges)):
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
     if args.samples is not None and (args.servo is not None or args.samples < 1):
@@ -134,8 +136,9 @@ def _check_export(args: argparse.Namespace) -> None:
     elif args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:
-        if args.urdf is None and args.mjcf is None:
-            raise UsageError("nothing to write; have: --urdf FILE, --mjcf FILE, --onto INPUT")
+        if args.urdf is None and args.mjcf is None and args.ranges is None:
+            have = "--urdf FILE, --mjcf FILE, --onto INPUT, --ranges FILE"
+            raise UsageError(f"nothing to write; have: {have}")
     elif args.onto.suffix not in (".urdf", ".xml"):
         raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
     elif args.urdf is None and args.mjcf is None:

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects, with_bodies
+from adapter.effects.ranges import ranges
 from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
@@ -225,6 +226,11 @@ def run_export(args: argparse.Namespace) -> int:
         facts["notes"] = [*facts.get("notes", ()), *written.notes]
         onto = "" if written.onto is None else f" onto {written.onto}"
         show(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
+    if args.ranges is not None:
+        found = ranges(model)
+        write_json(args.ranges, found)
+        facts["ranges"] = str(args.ranges)
+        show(f"{args.ranges}: {len(found['directions'])} directions, {model.name}")
     write_json(args.json, facts)
     for key, what in (("lambda_filled", "no motion"), ("theta_filled", "no torque")):
         if facts[key]:

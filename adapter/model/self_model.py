@@ -323,21 +323,18 @@ class SelfModel:
         >>> adapter.load_model("panda").sample(2)  # as documented: nothing is in doubt
         [SelfModel(panda: 7 joints, λ documentation), SelfModel(panda: 7 joints, λ documentation)]
         """
-        rng, numbers = np.random.default_rng(seed), doubted(self.effects)
-        drawn = Doubt.over(self.theta, self.theta_std, numbers, self.posterior).draws(n, rng)
+        rng = np.random.default_rng(seed)
+        drawn = self.doubt().draws(n, rng)
         own = np.nan_to_num(self.lam_std)[..., None] * np.eye(6)
         roots = own if self.posterior is None else self.posterior.lam_root
         moved = np.einsum("jab,sjb->sja", roots, rng.standard_normal((n, *self.lam.shape)))
         turned = zxz_from_matrix(exp_rotation(moved[..., :3]) @ self.joint_rotation())
         lam = np.concatenate([turned, self.lam[:, 3:] + moved[..., 3:]], axis=2)
         lam = np.where(moved.any(axis=2, keepdims=True), lam, self.lam)
-        size = self.theta.size
         return [
             replace(
-                self,
+                self.with_numbers(drawn[k]),
                 lam=lam[k],
-                theta=drawn[k, :size].reshape(-1, 10),
-                effects=with_numbers(self.effects, numbers, drawn[k, size:]),
                 lam_std=np.full(self.lam.shape, np.nan),
                 theta_std=np.full(self.theta.shape, np.nan),
                 posterior=None,
@@ -345,6 +342,16 @@ class SelfModel:
             )
             for k in range(n)
         ]
+
+    def doubt(self) -> Doubt:
+        """What is known of θ and of the effects' numbers that have a standard deviation."""
+        return Doubt.over(self.theta, self.theta_std, doubted(self.effects), self.posterior)
+
+    def with_numbers(self, values: Array) -> SelfModel:
+        """With other numbers (p,), in the order of `doubt`: θ, then those of effects."""
+        theta, size = values[: self.theta.size].reshape(self.theta.shape), self.theta.size
+        effects = with_numbers(self.effects, doubted(self.effects), values[size:])
+        return replace(self, theta=theta, effects=effects)
 
     def joint_rotation(self) -> Array:
         """Orientation (n, 3, 3) of each link frame in its parent's at q = 0."""
