@@ -111,6 +111,8 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=0, help="of the samples")
     said = "means, standard deviations, and the directions that make torques unsure, JSON to write"
     add("--ranges", type=Path, metavar="FILE", help=said)
+    said = "the arm's torque in C99, bodies and effects: feed-forward, and what no format holds"
+    add("--c", type=Path, metavar="FILE", help=said)
     onto = parser.add_mutually_exclusive_group()
     onto.add_argument(
         "--onto",
@@ -126,7 +128,8 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 def _check_export(args: argparse.Namespace) -> None:
     if args.lerobot is not None:
-        if any((args.urdf, args.mjcf, args.onto, args.alone, args.servo, args.ranges)):
+        others = args.urdf, args.mjcf, args.onto, args.alone, args.servo, args.ranges, args.c
+        if any(others):
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
     if args.samples is not None and (args.servo is not None or args.samples < 1):
@@ -136,8 +139,8 @@ def _check_export(args: argparse.Namespace) -> None:
     elif args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:
-        if args.urdf is None and args.mjcf is None and args.ranges is None:
-            have = "--urdf FILE, --mjcf FILE, --onto INPUT, --ranges FILE"
+        if all(x is None for x in (args.urdf, args.mjcf, args.ranges, args.c)):
+            have = "--urdf FILE, --mjcf FILE, --onto INPUT, --ranges FILE, --c FILE"
             raise UsageError(f"nothing to write; have: {have}")
     elif args.onto.suffix not in (".urdf", ".xml"):
         raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")

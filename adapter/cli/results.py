@@ -15,6 +15,7 @@ from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects, with_bodies
+from adapter.effects.c_text import c_text
 from adapter.effects.ranges import ranges
 from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
@@ -36,7 +37,7 @@ from adapter.runs.terminal import json_ready, output, program_version, show, war
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.lerobot import write_lerobot
 
-SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml"}
+SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml", "c": ".c"}
 
 
 class Learned(NamedTuple):
@@ -181,12 +182,10 @@ def write_robot(path: Path, written: RobotText) -> None:
 
 def shortcomings(path: Path, written: RobotText) -> list[str]:
     """What a robot's file lacks, and what else is to be said of it."""
-    said = [f"{path}: {note}" for note in written.notes]
-    if written.onto is None and written.left_out:
-        listed = ", ".join(written.left_out)
-        lacking = f"{path} has no full place for {listed}; a comment in it lists what is missing"
-        said.insert(0, lacking)
-    return said
+    lacking, listed = [], ", ".join(written.left_out)
+    if written.onto is None and listed:
+        lacking = [f"{path} has no full place for {listed}; a comment in it lists what is missing"]
+    return [*lacking, *(f"{path}: {note}" for note in written.notes)]
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -206,10 +205,12 @@ def run_export(args: argparse.Namespace) -> int:
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):
         facts[key] = list(model.provenance.get(key, ()))
-    for kind, path, text_of in zip(("urdf", "mjcf"), (args.urdf, args.mjcf), writers, strict=True):
+    paths = args.urdf, args.mjcf, args.c
+    writers.append(lambda model, **_: c_text(model))
+    for kind, path, text_of in zip(SUFFIXES, paths, writers, strict=True):
         if path is None:
             continue
-        fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")
+        fits = args.onto is not None and args.onto.suffix == SUFFIXES[kind]
         write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
         written = write(model)
         if args.samples is None:

@@ -160,34 +160,25 @@ def _from_json(data: Mapping[str, Any]) -> SelfModel:
 
 
 def _posterior_json(posterior: Posterior) -> dict[str, Any]:
-    """Of lower triangles what is not zero by their shape."""
+    """Of the lower triangle what is not zero by its shape."""
     return {
         "effects": [list(label) for label in posterior.effects],
         "least": _numbers(posterior.least),
-        "root": _triangle(posterior.root),
+        "root": [_numbers(row[: k + 1]) for k, row in enumerate(posterior.root)],
         "room": _numbers(posterior.room),
-        "lambda_root": [_triangle(root) for root in posterior.lam_root],
+        "lambda_root": _numbers(posterior.lam_root),
     }
-
-
-def _triangle(root: Any) -> list[Any]:
-    return [_numbers(row[: k + 1]) for k, row in enumerate(root)]
 
 
 def _posterior(data: Mapping[str, Any], n: int) -> Posterior:
     try:
         effects = tuple((str(e), int(joint), str(key)) for e, joint, key in data["effects"])
-        root, *lam_root = (
-            np.array([[*row, *[0.0] * (len(rows[-1]) - len(row))] for row in rows], dtype=float)
-            for rows in (data["root"], *data["lambda_root"])
-        )
+        least, rows = np.array(data["least"], dtype=float), data["root"]
+        root = np.array([[*row, *[0.0] * (len(rows[-1]) - len(row))] for row in rows], dtype=float)
     except (IndexError, KeyError, TypeError, ValueError):
-        raise ModelError("'posterior' must hold effects, root and lambda_root") from None
-    if not all(np.isfinite(x).all() for x in (root, *lam_root)):
-        raise ModelError("'posterior' holds a number that is not finite")
-    room = _needed(data, "room", (n, 10), "posterior")
-    least = np.array([] if not effects else data["least"], dtype=float)
-    return Posterior(effects, least, root, room, np.array(lam_root))
+        raise ModelError("'posterior' must hold effects, least and root") from None
+    lam_root = _needed(data, "lambda_root", (n, 6, 6), "posterior")
+    return Posterior(effects, least, root, _needed(data, "room", (n, 10), "posterior"), lam_root)
 
 
 def _part(data: Mapping[str, Any], key: str, kind: type, default: Any = None) -> Any:

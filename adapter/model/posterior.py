@@ -55,9 +55,9 @@ class Posterior:
 
     def check(self, n: int) -> None:
         """Raises ModelError where its shapes are not those of n joints."""
-        rows, e = 10 * n + len(self.effects), len(self.effects)
+        e = len(self.effects)
         have = np.shape(self.least), np.shape(self.root)[:1], self.room.shape, self.lam_root.shape
-        if have != ((e,), (rows,), (n, 10), (n, 6, 6)) or np.ndim(self.root) != 2:
+        if have != ((e,), (10 * n + e,), (n, 10), (n, 6, 6)):
             raise ModelError(f"a posterior of {n} joints and {e} numbers of effects has not {have}")
 
 
@@ -173,21 +173,17 @@ class Doubt(NamedTuple):
 
     @classmethod
     def over(
-        cls,
-        theta: Array,
-        theta_std: Array,
-        numbers: Sequence[Number],
-        posterior: Posterior | None,
+        cls, theta: Array, std: Array, numbers: Sequence[Number], posterior: Posterior | None
     ) -> Doubt:
         """Over θ (bodies, 10) and the effects' numbers.
 
         Of what the posterior does not tell each number has its own standard deviation alone, and
         keeps its sign; without one (NaN) it stays.
         """
-        value, std = (np.array([getattr(x, key) for x in numbers]) for key in ("value", "std"))
+        value, own_std = (np.array([getattr(x, k) for x in numbers]) for k in ("value", "std"))
         low, high = np.where(value > 0.0, 0.0, -np.inf), np.where(value < 0.0, 0.0, np.inf)
         mean, room = np.concatenate([theta.ravel(), value]), np.zeros_like(theta)
-        root = np.diag(np.concatenate([np.nan_to_num(theta_std).ravel(), std]))
+        root = np.diag(np.concatenate([np.nan_to_num(std).ravel(), own_std]))
         if posterior is not None:
             told = posterior.room.size  # θ of the links, after that of a base which floats
             place = {label: told + k for k, label in enumerate(posterior.effects)}
