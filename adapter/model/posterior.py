@@ -186,15 +186,16 @@ class Doubt(NamedTuple):
         root = np.diag(np.concatenate([np.nan_to_num(std).ravel(), own_std]))
         if posterior is not None:
             told = posterior.room.size  # θ of the links, after that of a base which floats
-            place = {label: told + k for k, label in enumerate(posterior.effects)}
-            own = [k for k, x in enumerate(numbers) if x.label in place]
-            rows = [place[numbers[k].label] for k in own]
+            first = {x.label: k for k, x in reversed([*enumerate(numbers)])}
+            # of a number that a search refined later the rest has its own deviation
+            rows = [k for k, label in enumerate(posterior.effects) if label in first]
+            own = [first[posterior.effects[k]] for k in rows]
             at = [*range(theta.size - told, theta.size), *(theta.size + k for k in own)]
             together = np.zeros((len(mean), posterior.root.shape[1]))
-            together[at] = posterior.root[[*range(told), *rows]]
+            together[at] = posterior.root[[*range(told), *(told + k for k in rows)]]
             root[at] = 0.0
             root = np.hstack([root, together])
-            low[own], high[own] = posterior.least[np.array(rows, dtype=int) - told], np.inf
+            low[own], high[own] = posterior.least[np.array(rows, dtype=int)], np.inf
             room[len(theta) - len(posterior.room) :] = posterior.room
         return cls(mean, root[:, root.any(axis=0)], room, low, high)
 

@@ -116,3 +116,14 @@ def test_without_a_posterior_each_number_has_its_own_deviation() -> None:
     assert np.isclose(theta[:, 0].std(), 0.1, rtol=0.1) and not np.ptp(theta[:, 1:], axis=0).any()
     first, second = np.array([m.effects[0]["parameters"]["Fv"] for m in drawn]).T
     assert (first >= 0.0).all() and first.std() > 0.3 and (second == 0.2).all()
+
+
+def test_what_a_search_refined_later_has_its_own_deviation() -> None:
+    """Two entries of one number: the posterior is of the first."""
+    model = known(0.003, BODY, BODY)
+    later = {**model.effects[1], "parameters": {"o": 0.2}, "std": {"o": 0.05}}
+    drawn = replace(model, effects=(*model.effects, later)).sample(COUNT)
+    first, second = np.array([[e["parameters"]["o"] for e in m.effects[1:]] for m in drawn]).T
+    assert model.posterior is not None
+    assert np.isclose(first.std(), np.linalg.norm(model.posterior.root[21]), rtol=0.1)
+    assert np.isclose(second.std(), 0.05, rtol=0.1) and abs(np.corrcoef(first, second)[0, 1]) < 0.1
