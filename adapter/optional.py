@@ -36,7 +36,7 @@ def missing(module: str | None) -> str | None:
 
 def load(module: str) -> Any:
     """A module of `EXTRAS`, loaded without what it prints by itself. Raises MeansError."""
-    if module in sys.modules:
+    if sys.modules.get(module) is not None:
         return sys.modules[module]
     try:
         with _unheard():

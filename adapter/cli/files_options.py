@@ -106,6 +106,13 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     add("--lerobot", type=Path, metavar="FOLDER", help="of LOG: a data set, version 3, to write")
     add("--urdf", type=Path, metavar="FILE", help="to write")
     add("--mjcf", type=Path, metavar="FILE", help="to write")
+    said = "models drawn from what is known of MODEL; --urdf and --mjcf name a folder: 0000.urdf"
+    add("--samples", type=int, metavar="N", help=said)
+    add("--seed", type=int, default=0, help="of the samples")
+    said = "means, standard deviations, and the directions that make torques unsure, JSON to write"
+    add("--ranges", type=Path, metavar="FILE", help=said)
+    said = "the arm's torque in C99, bodies and effects: feed-forward, and what no format holds"
+    add("--c", type=Path, metavar="FILE", help=said)
     onto = parser.add_mutually_exclusive_group()
     onto.add_argument(
         "--onto",
@@ -121,19 +128,25 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 def _check_export(args: argparse.Namespace) -> None:
     if args.lerobot is not None:
-        if args.urdf or args.mjcf or args.onto or args.alone or args.servo:
+        others = args.urdf, args.mjcf, args.onto, args.alone, args.servo, args.ranges, args.c
+        if any(others):
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
+    if args.samples is not None and (args.servo is not None or args.samples < 1):
+        raise UsageError("--samples N (1 or more) are drawn from a learned model, not of --servo")
     if args.servo is not None:
         options.check_robot(str(args.model))
     elif args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:
-        if args.urdf is None and args.mjcf is None:
-            raise UsageError("nothing to write; have: --urdf FILE, --mjcf FILE, --onto INPUT")
+        if all(x is None for x in (args.urdf, args.mjcf, args.ranges, args.c)):
+            have = "--urdf FILE, --mjcf FILE, --onto INPUT, --ranges FILE, --c FILE"
+            raise UsageError(f"nothing to write; have: {have}")
     elif args.onto.suffix not in (".urdf", ".xml"):
         raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
     elif args.urdf is None and args.mjcf is None:
+        if args.samples is not None:
+            raise UsageError("--samples need a folder: --urdf FOLDER, --mjcf FOLDER")
         path = args.onto.with_suffix(f".learned{args.onto.suffix}")
         args.urdf, args.mjcf = (path, None) if path.suffix == ".urdf" else (None, path)
     elif (args.urdf if args.onto.suffix == ".urdf" else args.mjcf) is None:

@@ -14,7 +14,9 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
-from adapter.effects.active import check_effects
+from adapter.effects.active import check_effects, with_bodies
+from adapter.effects.c_text import c_text
+from adapter.effects.ranges import ranges
 from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
@@ -35,6 +37,8 @@ from adapter.runs.score import Reference, counted_from
 from adapter.runs.terminal import json_ready, output, program_version, show, warn, write_json
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.lerobot import write_lerobot
+
+SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml", "c": ".c"}
 
 
 class Learned(NamedTuple):
@@ -175,10 +179,15 @@ def write_urdf(model: SelfModel, path: Path, whose: str = "", told: bool = False
 def write_robot(path: Path, written: RobotText) -> None:
     """Write a robot's file; warns of what it lacks."""
     path.write_bytes(written.text.encode())
-    if written.onto is None and written.left_out:
-        listed = ", ".join(written.left_out)
-        warn([f"{path} has no full place for {listed}; a comment in it lists what is missing"])
-    warn([f"{path}: {note}" for note in written.notes])
+    warn(shortcomings(path, written))
+
+
+def shortcomings(path: Path, written: RobotText) -> list[str]:
+    """What a robot's file lacks, and what else is to be said of it."""
+    lacking, listed = [], ", ".join(written.left_out)
+    if written.onto is None and listed:
+        lacking = [f"{path} has no full place for {listed}; a comment in it lists what is missing"]
+    return [*lacking, *(f"{path}: {note}" for note in written.notes)]
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -198,18 +207,33 @@ def run_export(args: argparse.Namespace) -> int:
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):
         facts[key] = list(model.provenance.get(key, ()))
-    for kind, path, text_of in zip(("urdf", "mjcf"), (args.urdf, args.mjcf), writers, strict=True):
+    paths = args.urdf, args.mjcf, args.c
+    writers.append(lambda model, **_: c_text(model))
+    for kind, path, text_of in zip(SUFFIXES, paths, writers, strict=True):
         if path is None:
             continue
-        fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")
-        written = text_of(model, onto=args.onto if fits else None, alone=args.alone)
-        write_robot(path, written)
+        fits = args.onto is not None and args.onto.suffix == SUFFIXES[kind]
+        write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
+        written = write(model)
+        if args.samples is None:
+            write_robot(path, written)
+        else:
+            path.mkdir(parents=True, exist_ok=True)
+            for number, drawn in enumerate(with_bodies(model).sample(args.samples, args.seed)):
+                file = path / f"{number:04d}{SUFFIXES[kind]}"
+                file.write_bytes(write(drawn).text.encode())
+            warn(shortcomings(path, written))
         facts[kind] = str(path)
         facts["onto"] = facts.get("onto") or written.onto
         facts["left_out"] = sorted({*facts.get("left_out", ()), *written.left_out})
         facts["notes"] = [*facts.get("notes", ()), *written.notes]
         onto = "" if written.onto is None else f" onto {written.onto}"
         show(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
+    if args.ranges is not None:
+        found = ranges(model)
+        write_json(args.ranges, found)
+        facts["ranges"] = str(args.ranges)
+        show(f"{args.ranges}: {len(found['directions'])} directions, {model.name}")
     write_json(args.json, facts)
     for key, what in (("lambda_filled", "no motion"), ("theta_filled", "no torque")):
         if facts[key]:

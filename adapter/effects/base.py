@@ -420,6 +420,9 @@ class Effect(ABC):
                     continue
                 raise ModelError(f"{self.name} needs '{p.key}' ({p.unit})")
             given = values[p.key]
+            plain = isinstance(given, float) and p.count == 1 and math.isfinite(given)
+            if plain and p.lower <= given <= p.upper:
+                continue  # nearly all are, and thousands are checked where models are drawn
             try:
                 value = np.asarray(given, dtype=float)
             except (TypeError, ValueError):

@@ -28,13 +28,8 @@ def experiment(parser: argparse.ArgumentParser) -> None:
     add("--no-baselines", action="store_true", help="atlas: only the FOP networks")
     add("--trajectories", type=int, default=63, metavar="N", help="atlas: default 63")
     add("--seconds", type=float, default=10.0, metavar="S", help="atlas: of each; default 10")
-    add(
-        "--seeds",
-        type=int,
-        default=20,
-        metavar="N",
-        help="recordings whose tree is to be found, N and A unknown; default 20",
-    )
+    said = "recordings whose tree is to be found, N and A unknown; default 20"
+    add("--seeds", type=int, default=20, metavar="N", help=said)
     add("--seed", type=int, default=0, help="of every random choice")
     add("--cache", type=Path, metavar="FOLDER", help="where simulated data are kept")
     add("--out", type=Path, metavar="FOLDER", help="where results go")
@@ -79,13 +74,8 @@ def bench(parser: argparse.ArgumentParser) -> None:
     add("--repeats", type=int, default=2000, metavar="N", help="default 2000")
     add("--log", type=Path, metavar="LOG", help="recording of an arm to compare held-out torque on")
     add("--robot", default="panda", metavar="NAME|FILE", help="the arm as documented")
-    add(
-        "--validate-from",
-        type=float,
-        default=14.0,
-        metavar="S",
-        help="learn before this second of LOG, score after it; default 14",
-    )
+    said = "learn before this second of LOG, score after it; default 14"
+    add("--validate-from", type=float, default=14.0, metavar="S", help=said)
     add("--json", type=Path, metavar="FILE", help="write the figures")
     parser.set_defaults(check=_check_bench)
 

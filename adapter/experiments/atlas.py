@@ -356,17 +356,12 @@ def noisy(data: TreeData, seed: int) -> TreeData:
         return x + std * rng.normal(size=x.shape)
 
     def moving(motion: BodyMotion) -> BodyMotion:
-        return BodyMotion(
-            with_noise(motion.w, NOISE_W),
-            with_noise(motion.a, NOISE_A),
-            with_noise(motion.dw, NOISE_DW),
-        )
+        pairs = (motion.w, NOISE_W), (motion.a, NOISE_A), (motion.dw, NOISE_DW)
+        return BodyMotion(*(with_noise(*pair) for pair in pairs))
 
     tau = with_noise(data.tau, NOISE_TAU * data.tau.std(axis=0))
-    q, dq, ddq = (
-        with_noise(x, std)
-        for x, std in ((data.q, NOISE_Q), (data.dq, NOISE_DQ), (data.ddq, NOISE_DDQ))
-    )
+    pairs = (data.q, NOISE_Q), (data.dq, NOISE_DQ), (data.ddq, NOISE_DDQ)
+    q, dq, ddq = (with_noise(*pair) for pair in pairs)
     assert data.links is not None
     return TreeData(data.tree, q, dq, ddq, tau, moving(data.base), moving(data.links))
 

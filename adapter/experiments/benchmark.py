@@ -198,9 +198,8 @@ def _peer(repeats: int) -> dict[str, Any]:
         path.write_text(to_urdf(documented("panda")))
         model = DifferentiableRobotModel(os.fspath(path), device="cpu")
     for k in range(1, 8):
-        model.make_link_param_learnable(
-            f"panda_link{k}", "mass", UnconstrainedTensor(dim1=1, dim2=1)
-        )
+        mass = UnconstrainedTensor(dim1=1, dim2=1)
+        model.make_link_param_learnable(f"panda_link{k}", "mass", mass)
     adam = torch.optim.Adam(model.parameters(), lr=1e-3)
     q, dq, ddq, tau = torch.rand(4, 1, 7)
 

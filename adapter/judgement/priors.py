@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from adapter.effects.base import on_drum
 from adapter.effects.catalogue import LEARNED
+from adapter.model.inertia import LIGHT_KG
 from adapter.model.robot_file import made_up
 from adapter.model.spatial import Array
 from adapter.screening.likelihood import LOAD_STD
@@ -38,7 +39,7 @@ EFFECT_STD = {  # the same, of the effects' parameters
     "motor_inertia": MOTOR_KG_M2,
     "joint_spring": SPRING_NM_RAD,
 }
-SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `documented_std`
+SPREAD, SMALL_M, CENTRE_M = 0.25, 0.05, 0.1  # of `documented_std`
 
 
 def is_shown(effect: str, key: str, std: float | None, slides: bool = False) -> bool:

@@ -29,6 +29,7 @@ class LearnedPosterior(NamedTuple):
         held: what the hand carries beside the documented arm from the first sample on.
         payload: what a change at the hand brought; None without one.
         covariance: (10 bodies, 10 bodies) of θ in use as ADAM has it, its noise with memory.
+        joint: (10 n + e n, 10 n + e n) of the links' θ with what the hand carries, and of effects.
     """
 
     effects: Array
@@ -36,6 +37,7 @@ class LearnedPosterior(NamedTuple):
     held: Load
     payload: Load | None
     covariance: Array
+    joint: Array
 
 
 def learned_posterior(
@@ -88,6 +90,11 @@ def learned_posterior(
         before = way.T @ H @ way, way.T @ (rhs - H @ (way @ start))
     found = judge([part], std, positive, before)
     x, covariance = start + found.x, found.covariance
+    whole = np.zeros((10 * n + own.size, len(std)))  # by these: links with what the hand carries
+    whole[: 10 * n, links], whole[10 * n :, effects] = np.eye(10 * n), np.eye(own.size)
+    at_hand = hand.start - theta.spare.start + 10 * n + np.arange(10)
+    whole[np.ix_(at_hand, np.arange(10))] = np.eye(10)
+    whole[np.ix_(at_hand, np.arange(10, 20))] = spare * np.eye(10)
     in_use = (10 * theta.in_use[:, None] + np.arange(10)).ravel()
     return LearnedPosterior(
         x[effects].reshape(own.shape),
@@ -95,6 +102,7 @@ def learned_posterior(
         (x[:10], covariance[:10, :10]),
         (x[10:20], covariance[10:20, 10:20]) if spare else None,
         theta.covariance()[np.ix_(in_use, in_use)] / worth,
+        whole @ covariance @ whole.T,
     )
 
 

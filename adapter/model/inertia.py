@@ -16,6 +16,8 @@ from adapter.model.spatial import Array, skew
 
 PARAMETERS = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 UNITS = ("kg", *["kg m"] * 3, *["kg m²"] * 6)  # of these
+# Ten parameters of a body of 1 kg, 10 cm across, and kg that none is lighter than for such sizes.
+BODY_SIZE, LIGHT_KG = np.r_[1.0, np.full(3, 0.1), np.full(6, 0.01)], 0.1
 # The place of XX XY XZ YY YZ ZZ in a symmetric 3x3 matrix.
 _ROWS = (0, 0, 0, 1, 1, 2)
 _COLS = (0, 1, 2, 1, 2, 2)

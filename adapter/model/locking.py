@@ -91,6 +91,7 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
         provenance={**whole.provenance, LOCKED: {**whole.provenance.get(LOCKED, {}), **names}},
         lam_identifiable=None,
         theta_identifiable=None,
+        posterior=None,
     )
     return changed.with_base(model.tree.floating)
 

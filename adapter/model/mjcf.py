@@ -54,7 +54,7 @@ def read_mjcf(
     Raises:
         ModelError: one sentence naming the file, the element and the choices.
     """
-    compiled = _compiled(path)
+    compiled = compiled_mjcf(path)
     file = MjcfFile(compiled, Path(path), floating)
     for part in file.unused:
         warnings.warn(f"{path}: {part} is not used", ModelWarning, stacklevel=3)
@@ -79,12 +79,12 @@ def mjcf_onto(model: SelfModel, more: Additions, path: str | Path) -> tuple[str,
         ModelError: as `onto.changes_onto`; a body that stands in another file or has no name; a
             file whose <compiler> overrides what is written.
     """
-    file = MjcfFile(_compiled(path), Path(path), model.tree.floating)
+    file = MjcfFile(compiled_mjcf(path), Path(path), model.tree.floating)
     changes = changes_onto(model, more, file.robot())
     writer = _Writer(file, XmlText(file_text(path), str(path)))
     writer.write(model, more, changes)
     text = writer.xml.text()
-    back = MjcfFile(_compiled(path, text), Path(path), model.tree.floating)
+    back = MjcfFile(compiled_mjcf(path, text), Path(path), model.tree.floating)
     left = changes_onto(replace(model, source=None), more, back.robot(), READ_BACK)
     if left.origins or left.bodies:
         names = ", ".join([*left.origins, *left.bodies])
@@ -95,7 +95,7 @@ def mjcf_onto(model: SelfModel, more: Additions, path: str | Path) -> tuple[str,
     return text, changes.notes
 
 
-def _compiled(path: str | Path, text: str | None = None) -> Any:
+def compiled_mjcf(path: str | Path, text: str | None = None) -> Any:
     """MuJoCo's model of a file, or of a text in its place."""
     top = XmlText(file_text(path), str(path)).root.tag
     if top != "mujoco":

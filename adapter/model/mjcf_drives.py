@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from adapter import optional
 from adapter.errors import MeansError, ModelError
+from adapter.model.mjcf import compiled_mjcf
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_quaternion, quaternion_from_matrix, z_to_axis
 from adapter.model.urdf_text import number_text
@@ -130,19 +131,13 @@ class _Writer:
     def _read(self, text: str) -> Any:
         """MuJoCo's model of a text. Raises ModelError, MeansError."""
         mujoco = optional.load("mujoco")
+        if self.onto is not None:
+            return compiled_mjcf(self.onto, text)
         try:
-            if self.onto is None:
-                return mujoco.MjModel.from_xml_string(text)
-            folder = self.onto.parent
-            beside = [x.attributes["file"] for x in self.there if x.tag == "include"]
-            found = {name: (folder / name).read_bytes() for name in beside}
-            spec = mujoco.MjSpec.from_string(text, include=found)
-            spec.modelfiledir = str(folder)
-            return spec.compile()
+            return mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
             said = " ".join(str(error).split())
-            file = self.onto or self.model.name
-            raise ModelError(f"{file}: MuJoCo refuses it ({said})") from None
+            raise ModelError(f"{self.model.name}: MuJoCo cannot read it ({said})") from None
 
     def _named(self, tag: str, name: str) -> Element:
         for element in self.there:

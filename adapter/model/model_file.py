@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from adapter.errors import ModelError
+from adapter.model.posterior import Posterior
 from adapter.model.self_model import LIMITS, MJCF, URDF, FixedFrame, Limits, SelfModel, Source, Tool
 from adapter.model.tree import Tree
 from drivers.files.bounded import parse_json, read_text
@@ -112,6 +113,7 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         "theta": _numbers(model.theta),
         "theta_std": _numbers(model.theta_std),
         "theta_identifiable": _plain(model.theta_identifiable),
+        "posterior": None if model.posterior is None else _posterior_json(model.posterior),
         "base_theta": _numbers(model.base_theta),
         "effects": _plain(model.effects),
         "gravity": _numbers(model.gravity),
@@ -146,6 +148,7 @@ def _from_json(data: Mapping[str, Any]) -> SelfModel:
         lam=lam,
         theta=theta,
         limits=Limits(**{k: np.full(n, np.nan) if v is None else v for k, v in limits.items()}),
+        posterior=_posterior(_part(data, "posterior", dict), n) if data.get("posterior") else None,
         frames=tuple(_frame(item) for item in _part(data, "frames", list, [])),
         tool=_tool(_part(data, "tool", dict)) if data.get("tool") else None,
         effects=tuple(_part(data, "effects", list, [])),
@@ -154,6 +157,28 @@ def _from_json(data: Mapping[str, Any]) -> SelfModel:
         provenance=_part(data, "provenance", dict, {}),
         **{key: value for key, value in optional.items() if value is not None},
     )
+
+
+def _posterior_json(posterior: Posterior) -> dict[str, Any]:
+    """Of the lower triangle what is not zero by its shape."""
+    return {
+        "effects": [list(label) for label in posterior.effects],
+        "least": _numbers(posterior.least),
+        "root": [_numbers(row[: k + 1]) for k, row in enumerate(posterior.root)],
+        "room": _numbers(posterior.room),
+        "lambda_root": _numbers(posterior.lam_root),
+    }
+
+
+def _posterior(data: Mapping[str, Any], n: int) -> Posterior:
+    try:
+        effects = tuple((str(e), int(joint), str(key)) for e, joint, key in data["effects"])
+        least, rows = np.array(data["least"], dtype=float), data["root"]
+        root = np.array([[*row, *[0.0] * (len(rows[-1]) - len(row))] for row in rows], dtype=float)
+    except (IndexError, KeyError, TypeError, ValueError):
+        raise ModelError("'posterior' must hold effects, least and root") from None
+    lam_root = _needed(data, "lambda_root", (n, 6, 6), "posterior")
+    return Posterior(effects, least, root, _needed(data, "room", (n, 10), "posterior"), lam_root)
 
 
 def _part(data: Mapping[str, Any], key: str, kind: type, default: Any = None) -> Any:

@@ -11,7 +11,8 @@ import numpy as np
 from adapter.errors import ModelError
 from adapter.model.inertia import move_theta, theta_from_body
 from adapter.model.numbers import plus_minus
-from adapter.model.spatial import Array, matrix_from_zxz
+from adapter.model.posterior import Doubt, Posterior, doubted, with_numbers
+from adapter.model.spatial import Array, exp_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import Tree
 from drivers.files.html_table import html_table
 
@@ -173,6 +174,8 @@ class SelfModel:
             of it (`identifiability.BaseParameters.shown_map`); NaN where unknown.
         lam_identifiable: (n, 6) bool, the same directions as `lam_std`; None where not judged.
         theta_identifiable: (bodies, 10) bool, the parameter alone; None where not judged.
+        posterior: what is known of all that was learned together; None where nothing is beside
+            the standard deviations.
         effects: one mapping each {effect, joints, parameters} with what goes along ({interval_s,
             std, units, evidence, ...}), JSON values only; what they mean, and whether they are
             right, `effects.active` knows.
@@ -198,6 +201,7 @@ class SelfModel:
     theta_std: Array = None  # type: ignore[assignment]
     lam_identifiable: np.ndarray | None = None
     theta_identifiable: np.ndarray | None = None
+    posterior: Posterior | None = None
     effects: tuple[Mapping[str, Any], ...] = ()
     lambda_source: str = LAMBDA_DOCUMENTATION
     source: Source | None = None
@@ -228,6 +232,8 @@ class SelfModel:
                 raise ModelError(f"{what} rides on '{link}'; have: {', '.join(links)}")
         if self.tool is not None and not self.tool.mass > 0:
             raise ModelError(f"a tool's mass must be above zero, got {self.tool.mass}")
+        if self.posterior is not None:
+            self.posterior.check(n)
         if self.source is not None and np.shape(self.source.lam) != (n, 6):
             raise ModelError(f"source.lam must have shape {(n, 6)}, got {self.source.lam.shape}")
 
@@ -300,6 +306,52 @@ class SelfModel:
         return replace(
             self, tree=tree, theta=theta, theta_std=std, base_theta=base, theta_identifiable=None
         )
+
+    def sample(self, n: int = 1, seed: int = 0) -> list[SelfModel]:
+        """Models drawn from what is known of this one; every body of theirs can exist.
+
+        θ and the effects' numbers are drawn together, with the correlations that `posterior` has;
+        without one each has its own standard deviation. What has none, and what no data showed,
+        stays as it is; only where bodies could not exist otherwise, what no data showed gives way.
+        Frames are drawn joint by joint beside them.
+
+        Args:
+            n: how many, from 1.
+            seed: of the draws; the same one gives the same models.
+
+        >>> import adapter
+        >>> adapter.load_model("panda").sample(2)  # as documented: nothing is in doubt
+        [SelfModel(panda: 7 joints, λ documentation), SelfModel(panda: 7 joints, λ documentation)]
+        """
+        rng = np.random.default_rng(seed)
+        drawn = self.doubt().draws(n, rng)
+        own = np.nan_to_num(self.lam_std)[..., None] * np.eye(6)
+        roots = own if self.posterior is None else self.posterior.lam_root
+        moved = np.einsum("jab,sjb->sja", roots, rng.standard_normal((n, *self.lam.shape)))
+        turned = zxz_from_matrix(exp_rotation(moved[..., :3]) @ self.joint_rotation())
+        lam = np.concatenate([turned, self.lam[:, 3:] + moved[..., 3:]], axis=2)
+        lam = np.where(moved.any(axis=2, keepdims=True), lam, self.lam)
+        return [
+            replace(
+                self.with_numbers(drawn[k]),
+                lam=lam[k],
+                lam_std=np.full(self.lam.shape, np.nan),
+                theta_std=np.full(self.theta.shape, np.nan),
+                posterior=None,
+                provenance={**self.provenance, "sample": {"seed": seed, "number": k}},
+            )
+            for k in range(n)
+        ]
+
+    def doubt(self) -> Doubt:
+        """What is known of θ and of the effects' numbers that have a standard deviation."""
+        return Doubt.over(self.theta, self.theta_std, doubted(self.effects), self.posterior)
+
+    def with_numbers(self, values: Array) -> SelfModel:
+        """With other numbers (p,), in the order of `doubt`: θ, then those of effects."""
+        theta, size = values[: self.theta.size].reshape(self.theta.shape), self.theta.size
+        effects = with_numbers(self.effects, doubted(self.effects), values[size:])
+        return replace(self, theta=theta, effects=effects)
 
     def joint_rotation(self) -> Array:
         """Orientation (n, 3, 3) of each link frame in its parent's at q = 0."""

@@ -109,9 +109,11 @@ def log_rotation(rotation: ArrayLike) -> Array:
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Array:
     """Unit quaternions [w x y z] (..., 4) of rotations (..., 3, 3), w not below zero."""
-    turn = log_rotation(rotation)
-    half = 0.5 * np.linalg.norm(turn, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * turn], axis=-1)
+    from scipy.spatial.transform import Rotation
+
+    r = np.asarray(rotation, dtype=np.float64)
+    xyzw = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.roll(xyzw, 1, axis=-1).reshape(*r.shape[:-2], 4)
 
 
 def quaternion_product(a: ArrayLike, b: ArrayLike) -> Array:

@@ -7,6 +7,7 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,9 @@ def parse_urdf(text: str, file: str) -> FileRobot:
         raise ModelError(f"{file}: no <link> in it")
     source = Source(URDF, Path(file).name, text)
     return FileRobot(file, root.get("name", "robot"), links, joints, source)
+
+
+_parsed = lru_cache(maxsize=1)(parse_urdf)  # of the many models that are written onto one file
 
 
 def _attribute(element: ET.Element, key: str, file: str, what: str) -> str:
@@ -245,7 +249,7 @@ def urdf_onto(model: SelfModel, more: Additions, text: str, file: str) -> tuple[
     Raises:
         ModelError: as `onto.changes_onto`.
     """
-    robot = parse_urdf(text, file)
+    robot = _parsed(text, file)
     changes = changes_onto(model, more, robot)
     xml = XmlText(text, file)
     joints = {x.attributes["name"]: x for x in xml.root.children if x.tag == "joint"}
@@ -314,7 +318,7 @@ def _write_inertial(xml: XmlText, link: Element, theta: Array) -> None:
 def _put(xml: XmlText, element: Element, key: str, value: ArrayLike, scale: float) -> None:
     """Give an attribute its numbers; where it has them but for rounding of a scale, it stays."""
     now = element.attributes.get(key)
-    if now is None or not np.allclose(_array(now), value, rtol=0.0, atol=SAME * scale):
+    if now is None or not np.abs(np.subtract(_array(now), value)).max() <= SAME * scale:
         xml.set(element, key, number_text(np.asarray(value)))
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapter.model.inertia import BODY_SIZE
 from adapter.model.spatial import Array, matrix_from_zxz, skew
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
@@ -20,9 +21,6 @@ from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, link_m
 # Singular values below this, relative to the largest, count as zero. Random motion leaves a gap
 # of many decades: true ones stay above 1e-6 on arms, rounding below 1e-14.
 RANK_TOLERANCE = 1e-10
-
-# Ten parameters of a body of 1 kg, 10 cm across: kg, kg m, kg m².
-BODY_SIZE = np.r_[1.0, np.full(3, 0.1), np.full(6, 0.01)]
 
 # Turns and shifts that change a link's motion by less than this share do not count as shown: axes
 # that a URDF has upright to five digits, and no more, show nothing that a sensor could tell.

@@ -22,6 +22,7 @@ from adapter.learning.learner import NOT_ASKED, OnlineLearner, TorqueVerdict
 from adapter.learning.posterior import Load
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
+from adapter.model.posterior import Posterior, room_of, root_of
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import Tree
@@ -55,6 +56,7 @@ class Outcome:
             the joints; theta_settled: it is inside the goal, or the learner says so.
         theta_information: (10 bodies, 10 bodies) that data have on θ, see `Theta.told_by_data`.
         covariance: (10 bodies, 10 bodies) of θ, see `LearnedPosterior`.
+        joint_covariance: (10 n + e n, 10 n + e n) of the links' θ and the effects, see there.
         least_squares: (P,) of the learner's flat parameters.
         held: (theta (10,), covariance (10, 10)) of what the hand carries from the first sample on,
             beside the documented arm; payload: since a change.
@@ -93,6 +95,7 @@ class Outcome:
     theta_settled: bool
     theta_information: Array
     covariance: Array
+    joint_covariance: Array
     least_squares: Array
     held: Load
     payload: Load | None
@@ -154,6 +157,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         theta_settled=started and (learner.theta_converged or excess <= TORQUE_GOAL),
         theta_information=theta.told_by_data(),
         covariance=known.covariance,
+        joint_covariance=known.joint,
         least_squares=batch,
         held=known.held,
         payload=known.payload,
@@ -271,11 +275,13 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     told = told_parameters(outcome, documented)
     theta, said = completed_theta(outcome, documented, lam, told.basis)
     share = np.einsum("ab,ab->a", told.basis, told.basis).reshape(-1, 10)
-    theta_std = np.full((bodies, 10), np.nan)
+    theta_std, posterior = np.full((bodies, 10), np.nan), None
     if known:  # of what torques told of θ; the rest is documentation
         way = told.shown_map()
         variance_told = np.einsum("ai,ij,aj->a", way, outcome.covariance, way)
         theta_std = np.sqrt(np.maximum(variance_told, 0.0)).reshape(-1, 10)
+        if not documented.tree.floating:
+            posterior = _posterior(outcome, theta, told)
     return replace(
         documented,
         name=f"{documented.name} (learned)",
@@ -286,6 +292,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         lam_identifiable=shown,
         theta_std=theta_std,
         theta_identifiable=share > SHOWN_SHARE,
+        posterior=posterior,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
         provenance={
@@ -308,6 +315,25 @@ def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
             entry["std"] = {effect.key: float(outcome.effects_std[k, j])}
             entries.append({**entry, "units": KNOWN[name].units(tree.slides[j])})
     return entries
+
+
+def _posterior(outcome: Outcome, theta: Array, told: BaseParameters) -> Posterior:
+    """Doubt of all that was learned: of θ and of frames in the directions that data showed."""
+    shown, labels, least = outcome.lam_identifiable, [], []
+    for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
+        for j, (value, shape) in enumerate(zip(outcome.effects[k], outcome.shapes[k], strict=True)):
+            labels.append((effect.learned_as(value, shape)[0], j + 1, effect.key))
+            least.append(0.0 if effect.key in effect.positive else -np.inf)
+    way = np.eye(theta.size + len(labels))
+    way[: theta.size, : theta.size] = told.shown_map()
+    covariance = way @ outcome.joint_covariance @ way.T
+    return Posterior(
+        tuple(labels),
+        np.array(least),
+        root_of(covariance, told.rank + len(labels)),
+        room_of(theta, told.basis),
+        np.array([root_of(own, len(own)) for own in shown @ outcome.lam_covariance @ shown]),
+    )
 
 
 def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, Any]]:

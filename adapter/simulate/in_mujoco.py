@@ -8,21 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from adapter.errors import MeansError, ModelError
+from adapter import optional
+from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import ARMATURE
 from adapter.simulate.arm import SimulatedArm, plain_urdf
 from adapter.simulate.effects import Effects
-
-
-def library() -> Any:
-    """MuJoCo's module. Raises MeansError where it is not installed."""
-    try:
-        import mujoco
-    except ImportError:
-        raise MeansError("MuJoCo is missing: pip install 'panda-adapter[mujoco]'") from None
-    return mujoco
 
 
 class MujocoArm(SimulatedArm):
@@ -45,7 +37,7 @@ class MujocoArm(SimulatedArm):
     def __init__(
         self, model: SelfModel, simulated: tuple[Any, Any] | None = None, period_s: float = 1e-3
     ) -> None:
-        self._mujoco = library()
+        self._mujoco = optional.load("mujoco")
         if simulated is None:
             simulated = _alone(self._mujoco, model, period_s)
         self.model, self.data = simulated

@@ -17,7 +17,7 @@ from adapter.errors import ModelError, SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.simulate.arm import SimulatedArm
-from adapter.simulate.in_mujoco import MujocoArm, library
+from adapter.simulate.in_mujoco import MujocoArm
 from adapter.simulate.in_pybullet import PybulletArm
 from drivers.errors import choices
 
@@ -66,10 +66,7 @@ class Rollouts:
     def __init__(self, simulator: str = "pybullet") -> None:
         if simulator not in SIMULATORS:
             raise SettingsError(f"no simulator '{simulator}'; {choices(simulator, SIMULATORS)}")
-        if simulator == "mujoco":
-            library()
-        else:
-            optional.load("pybullet")
+        optional.load(simulator)
         self.simulator, self.troubles = simulator, list[str]()
 
     def __call__(

@@ -216,6 +216,8 @@ def test_a_cut_file(tmp_path, capsys) -> None:
         (["export", "panda", "--urdf", "x.urdf"], "give a model file (.json)"),
         (["export", "m.json", "--urdf", "x.xml"], "--mjcf FILE.xml"),
         (["export", "m.json", "--mjcf", "x.urdf"], "--urdf FILE.urdf"),
+        (["export", "m.json", "--mjcf", "x", "--samples", "0"], "--samples N (1 or more)"),
+        (["export", "m.json", "--onto", "x.xml", "--samples", "9"], "--mjcf FOLDER"),
         (["diff", "panda", "nowhere.urdf"], "nowhere.urdf: cannot be read"),
     ],
 )

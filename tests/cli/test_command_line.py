@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -112,6 +113,20 @@ def test_export(run, tmp_path: Path) -> None:
     exported = pin.buildModelFromUrdf(str(urdf))
     masses = [exported.inertias[k + 1].mass for k in range(7)]
     assert np.allclose(masses, model.theta[:, 0])
+
+
+def test_samples_of_a_learned_model_are_arms_that_mujoco_loads(run, tmp_path: Path) -> None:
+    folder, _ = run
+    line = ("export", folder / "model.json", "--samples", 20, "--seed", 3, "--json", tmp_path / "j")
+    command(*line, "--mjcf", tmp_path / "mjcf", "--urdf", tmp_path / "urdf")
+    drawn = load_model(folder / "model.json").sample(20, seed=3)
+    for kind, suffix in (("mjcf", "xml"), ("urdf", "urdf")):
+        files = sorted((tmp_path / kind).iterdir())
+        assert [x.name for x in files] == [f"{k:04d}.{suffix}" for k in range(20)]
+        for file, one in zip(files, drawn, strict=True):
+            arm = mujoco.MjModel.from_xml_path(str(file))
+            masses = [arm.body(name).mass[0] for name in one.tree.link_names]
+            assert np.allclose(masses, one.theta[:, 0], rtol=1e-9)
 
 
 def test_info_recover_and_report(run, tmp_path: Path, capsys) -> None:

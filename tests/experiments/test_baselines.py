@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapter.errors import ModelError
+from adapter.errors import MeansError, ModelError
 from adapter.experiments.baselines.by_physics import (
     DeepLagrangian,
     MassNetwork,
@@ -324,9 +324,7 @@ def test_the_test_and_the_control_set_have_no_say_in_the_settings() -> None:
     assert median["train"] == median_again["train"] and median["test"] != median_again["test"]
 
 
-def test_without_scikit_learn_the_error_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_scikit_learn_the_error_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.neural_network", None)
-    with pytest.raises(ModelError, match=r"pip install 'panda-adapter\[experiment\]'"):
+    with pytest.raises(MeansError, match=r"pip install 'panda-adapter\[experiment\]'"):
         FeedForward(units=3).fit(np.ones((5, 2)), np.ones((5, 1)))

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 from scipy import linalg, optimize
 
+from adapter import optional
 from adapter.errors import ModelError
 from adapter.experiments.baselines.learner import (
     Progress,
@@ -55,14 +56,10 @@ class FeedForward(ScaledBaseline):
         self.rate, self.seed = rate, seed
 
     def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
-        """Train on all samples in float32. Raises ModelError without scikit-learn."""
-        try:
-            from sklearn.neural_network import MLPRegressor
-        except ImportError:
-            said = "the feed-forward network needs scikit-learn; "
-            raise ModelError(f"{said}pip install 'panda-adapter[experiment]'") from None
+        """Train on all samples in float32. Raises MeansError without scikit-learn."""
+        regressor = optional.load("sklearn.neural_network").MLPRegressor
         x, y = x.astype(np.float32), y.astype(np.float32)
-        self._net = MLPRegressor(
+        self._net = regressor(
             hidden_layer_sizes=(self.units,),
             activation="tanh",
             solver="adam",

@@ -242,16 +242,8 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
     at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)
     for k, (name, errors) in enumerate(zip(("turn, rad", "shift, m"), off, strict=True)):
         side, color = -0.18 + 0.36 * k, (ACCENT, GOAL)[k]
-        ax.plot(
-            (at + side).ravel(),
-            errors.ravel(),
-            linestyle="none",
-            marker="o",
-            markersize=2.6,
-            color=color,
-            alpha=0.75,
-            label=name,
-        )
+        dots = (at + side).ravel(), errors.ravel(), "o"
+        ax.plot(*dots, markersize=2.6, color=color, alpha=0.75, label=name)
     log_axis(ax, 0.3 * off.min(), 5.0 * off.max())
     categories(ax, [label for label, _ in atlas.snapshots])
     legend(ax, loc="best")

@@ -80,7 +80,8 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
     """How fast the online learner is on the whole tree, and what it shows; None without any."""
     if not online:
         return None
-    settled = online["lambda_settled_s"]
+    settled_s = online["lambda_settled_s"]
+    settled = "not reached" if settled_s is None else with_unit(settled_s, "s", 3)
     steps = [
         with_unit(1e-3 * us, "ms", 3) if us >= 1e3 else with_unit(us, "µs", 3)
         for us in (online["step_p50_us"], online["step_p99_us"])
@@ -89,10 +90,7 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
         ["samples a second, on one core", with_unit(online["samples_per_second"], "1/s", 3)],
         ["time of a sample, median", steps[0]],
         ["time of a sample, 99th percentile", steps[1]],
-        [
-            "λ settled, θ begins after",
-            "not reached" if settled is None else with_unit(settled, "s", 3),
-        ],
+        ["λ settled, θ begins after", settled],
         ["directions of λ shown", f"{online['lambda_rank']} of {6 * online['joints']}"],
     ]
     return Table(["", "ATLAS"], rows)

@@ -43,13 +43,8 @@ def lambda_panels(panda: PandaResults) -> list[Panel]:
         for j in range(panda.tree.n):
             for k in range(part.start, part.stop):
                 shown = bool(panda.lam_shown[j, k])
-                ax.plot(
-                    t,
-                    path[:, j, k],
-                    color=joint_color(j),
-                    linewidth=1.2 if shown else 0.7,
-                    alpha=1.0 if shown else 0.45,
-                )
+                width, alpha = (1.2, 1.0) if shown else (0.7, 0.45)
+                ax.plot(t, path[:, j, k], color=joint_color(j), linewidth=width, alpha=alpha)
                 if shown:
                     ax.axhline(true[j, k], color=INK, linewidth=0.6, linestyle=(0, (4, 3)))
         _finish(drawing, t, panda)

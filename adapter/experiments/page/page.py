@@ -95,13 +95,8 @@ def panda_tiles(panda: PandaResults) -> list[Tile]:
     value = "not reached" if after is None else words.with_unit(float(after), "s", 3)
     found = [Tile("λ of the simulated Panda converged", value, "after the first motion")]
     if ratio is not None:
-        found.append(
-            Tile(
-                "Its torque error at the end",
-                words.scientific(ratio, 3),
-                "times batch least squares",
-            )
-        )
+        times = words.scientific(ratio, 3)
+        found.append(Tile("Its torque error at the end", times, "times batch least squares"))
     return found
 
 
