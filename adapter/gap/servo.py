@@ -67,7 +67,6 @@ NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
 HAND_ROWS = 500  # of a recording, where the way of the hand is told
 ROUGH_STEP_S = 8e-3  # of the first simulations
-STATIC_START = 0.3  # of Coulomb friction, at which static friction is first tried
 # what a limit, a dead band or backlash has to tell of blocks not seen, and its share of what was
 # left: simulated ones explain nearly all of it, on a real arm a wrong one explained a tenth
 LIMITED_CHI2, LIMITED_SHARE = 12.0, 0.25
@@ -256,18 +255,18 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
         tasks = replace(arm, tracks=tracks).tasks(motions)
     if arm.documented.is_ideal:
         arm = replace(arm, usual=float(np.median(x[:, A])))
-    x[:, STICKS] = STATIC_START * x[:, RUBS]
     fits = [
-        fit_joint(replace(task, usual=arm.usual), fit.freedom.beside(STICKS), own)
-        for task, fit, own in zip(tasks, fits, x, strict=True)
+        _limited(JointFit(replace(task, usual=arm.usual), fit.freedom, own), noise[j])
+        for j, (task, fit, own) in enumerate(zip(tasks, fits, x, strict=True))
     ]
-    fits = [_limited(fit, noise[j]) for j, fit in enumerate(fits)]
     tasks = arm.tasks([track.smooth for track in arm.tracks])
     return arm, [fit_joint(task, fit.freedom, fit.x) for task, fit in zip(tasks, fits, strict=True)]
 
 
 def _limited(fit: JointFit, noise: float) -> JointFit:
-    """A joint's fit with what else a servo has (torque limit, dead band, backlash) where it pays.
+    """A joint's fit with what else a servo has where it pays.
+
+    Static friction, a torque limit, a dead band, backlash.
 
     Args:
         noise: of the encoder, rad.
@@ -275,15 +274,17 @@ def _limited(fit: JointFit, noise: float) -> JointFit:
     equation = equations(fit.task)
     while np.sqrt(fit.error() / sum(map(np.sum, fit.task.rows))) > NOISE_SHARE * noise:
         fits = []
-        for k, within in ((TIGHT, 0.0), (TIGHT, 1.0), (DEAD, None), (PLAY, None)):
+        kinds = (STICKS, None), (TIGHT, 0.0), (TIGHT, 1.0), (DEAD, None), (PLAY, None)
+        for k, within in kinds:
             if fit.freedom.free[k] or (within == 1.0 and fit.x[LEAD] > 0.0):
                 continue
             freedom = fit.freedom.beside(k, within)
             starts = (freedom.full(x[freedom.free]) for x in guesses(equation, fit.x, k))
             start = min(starts, key=lambda x: misfit(fit.task.fitted(x)))
-            fits.append(fit_joint(fit.task, freedom, start))
-        best = min(fits, key=JointFit.error, default=fit)
-        if not _explains(best, fit, LIMITED_SHARE):
+            fits.append((fit_joint(fit.task, freedom, start), k))
+        fits.sort(key=lambda x: x[0].error())
+        best = next((own for own, k in fits if _explains(own, fit, k)), None)
+        if best is None:
             break
         fit = _needed(best, fit.freedom.free)  # what stood in for what is there now goes
     return fit
@@ -294,13 +295,13 @@ def _needed(fit: JointFit, asked: NDArray[np.bool_]) -> JointFit:
     for k in range(STICKS, WITHIN):
         if asked[k] and fit.freedom.free[k]:
             without = fit_joint(fit.task, fit.freedom.without(k), fit.x)
-            share = STATIC_SHARE if k == STICKS else LIMITED_SHARE
-            fit = fit if _explains(fit, without, share) else without
+            fit = fit if _explains(fit, without, k) else without
     return fit
 
 
-def _explains(fit: JointFit, without: JointFit, share: float) -> bool:
-    """Whether what a fit has and another has not explains a share of what that one leaves."""
+def _explains(fit: JointFit, without: JointFit, k: int) -> bool:
+    """Whether parameter k, which a fit has and another has not, explains enough of what is left."""
+    share = STATIC_SHARE if k == STICKS else LIMITED_SHARE
     least = max(LIMITED_CHI2 * fit.unit, share * without.error())
     return without.error() - fit.error() > least and _paid(fit, without) > LIMITED_CHI2
 

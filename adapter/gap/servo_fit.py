@@ -35,6 +35,7 @@ PARAMETERS, PLAIN = 11, 5  # in all; those that an equation without limits has
 # where edges of limits (of the most that a motion took, at `FULL` of its rows) and of dead bands
 # (shares of rows) start, and how far beyond the latter what is driven is free of chatter
 FULL, LIMITED, DULL, BEYOND = 0.98, (1.1, 0.9, 0.7), (0.05, 0.15, 0.3, 0.5), 1.4
+STATIC = 0.3  # of Coulomb friction, where static friction starts
 LATEST_S, EVERY_S = 0.05, 1e-3  # of the delays that are tried
 USUAL_HZ = 5.0  # at which position loops of arms close: 1 to 20
 BLOCK_S = 2.0  # of alternating blocks
@@ -280,6 +281,8 @@ def guesses(equation: Callable[[float], tuple[Array, Array]], x: Array, k: int) 
     if k == PLAY:
         (*found, play), _ = _solved(matrix, wanted)
         return [np.array([*found, *x[DELAY:PLAY], play, x[WITHIN]])]
+    if k == STICKS:
+        return [np.where(np.arange(PARAMETERS) == STICKS, STATIC * x[RUBS], x)]
     asked, starts = np.abs(wanted), []
     if k == TIGHT:  # what the joint's motion took is no more than the limit, whatever was asked
         calm = np.abs(wanted) < np.median(np.abs(wanted))
