@@ -206,10 +206,8 @@ def test_noisy_signals_cost_no_more_than_with_true_frames(seed: int) -> None:
     assert found.min_eigenvalue > 0.0
 
 
-def test_bad_input_is_named() -> None:
-    model, data = samples(random_urdf(5, 23), True, 30, 23)
-    with pytest.raises(ModelError, match="not finite"):
-        row_factors(replace(data, tau=data.tau * np.nan), model.lam)
+def test_a_base_at_rest_needs_gravity() -> None:
+    _, data = samples(random_urdf(5, 23), True, 30, 23)
     with pytest.raises(ModelError, match="gravity"):
         signals = {"q": data.q, "dq": data.dq, "tau": data.tau[:, 6:]}
         fixed = {name: np.tile(x, (20, 1)) for name, x in signals.items()}
