@@ -114,7 +114,7 @@ def test_a_plan_says_how_far_how_fast_and_how_to_stop():
 
 
 def test_is_rich_and_does_not_repeat():
-    motion = RandomMotion(LIMITS, build("nominal").truth.ready, ExcitationSettings(seed=3))
+    motion = RandomMotion(LIMITS, READY, ExcitationSettings(seed=3))
     path = []
     for _ in range(30_000):
         motion.advance(1e-2)

@@ -237,9 +237,3 @@ def test_branches_of_any_tree(seed: int) -> None:
     assert sorted(j for joints in found.values() for j in joints) == list(range(17))
     for joints in found.values():
         assert [parent[j] in joints for j in joints] == [False, *[True] * (len(joints) - 1)]
-
-
-def test_one_branch_for_an_arm() -> None:
-    tree = read_quietly(random_urdf(6, 3)).tree
-    chain = Tree((-1, 0, 1, 2), joint_names=tree.joint_names[:4])
-    assert list(branches(chain).values()) == [(0, 1, 2, 3)]
