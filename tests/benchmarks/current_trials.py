@@ -21,6 +21,7 @@ from adapter.effects.robots import read_robot
 from adapter.gap import GapSettings, find_gap
 from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log
+from tests.helpers.benchmark import with_columns
 
 SHARE, WIDE = 0.1, 100.0  # prior of inertias, of their kind's size; of all else
 RATE_HZ, INDEPENDENT_HZ = 100.0, 20.0  # of the rows; of what the band holds
@@ -54,7 +55,7 @@ def least_squares(log: Log, urdf: Path, split_s: float) -> np.ndarray:
     )
     theta = np.array([body.toDynamicParameters() for body in model.inertias[1:]])
     own = [np.ones_like(dq), np.tanh(dq / 0.01), dq, ddq]
-    columns = np.concatenate([Y, *(x[:, :, None] * np.eye(n) for x in own)], axis=2)
+    columns = with_columns(Y, own)
     mass = np.maximum(theta[:, :1], 0.1)
     first = np.maximum(np.linalg.norm(theta[:, 1:4], axis=1, keepdims=True), 0.05 * mass)
     second = np.maximum(np.abs(theta[:, [4, 6, 9]].mean(axis=1, keepdims=True)), 0.05**2 * mass)

@@ -8,7 +8,6 @@ regressor, made with Pinocchio, over the first ten seconds of each path. `make t
 
 from __future__ import annotations
 
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from adapter.learning.learner import OnlineLearner
 from adapter.model.robots import documented
 from adapter.signals.records import stamp_of
 from tests.helpers.benchmark import options, told
+from tests.helpers.robot_models import PANDA
 
 KINDS = ("random", "designed")
 EVERY_S, PATH_S = 0.25, 10.0
@@ -56,8 +56,7 @@ def curve(seed: int, kind: str, seconds: float) -> tuple[Curve, np.ndarray]:
 
 def condition(states: np.ndarray) -> float:
     """Of the regressor (Pinocchio) of base parameters picked by QR over random motion."""
-    path = resources.files("adapter") / "model" / "robots" / "panda.urdf"
-    model = pinocchio.buildModelFromUrdf(str(path))
+    model = pinocchio.buildModelFromUrdf(str(PANDA))
     data, n = model.createData(), states.shape[2]
 
     def stacked(motion: np.ndarray) -> np.ndarray:

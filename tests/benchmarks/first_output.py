@@ -9,8 +9,6 @@ the system's memory, as after a start of the machine. A command that goes on is 
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import select
 import site
@@ -24,10 +22,10 @@ from typing import Any
 import adapter
 from adapter.cli.main import COMMANDS
 from adapter.model.model_file import dumps
+from tests.helpers.benchmark import options, processor_s, write
 
 ROOT = Path(__file__).parents[2]
 LOG = str(ROOT / "recordings" / "panda_nominal_6s.mcap")
-TICKS = os.sysconf("SC_CLK_TCK")
 LONGEST_S = 120.0
 
 
@@ -48,6 +46,7 @@ def lines(folder: Path) -> dict[str, list[str]]:
         "load": ["load", LOG],
         "diff": ["diff", "panda", model],
         "discover": ["discover", LOG],
+        "effects": ["effects"],
         "sim": ["sim", "fci", "--port", "0"],
         "import": ["import", str(table), "--to", str(folder / "new.mcap")],
         "export": ["export", model, "--urdf", str(folder / "new.urdf")],
@@ -76,8 +75,7 @@ def first_output(words: list[str]) -> dict[str, Any]:
     assert process.stdout is not None
     heard = select.select([process.stdout], [], [], LONGEST_S)[0]
     wall_s = time.perf_counter() - begun
-    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-    used_s = (int(fields[11]) + int(fields[12])) / TICKS
+    used_s = processor_s([process.pid])
     said = os.read(process.stdout.fileno(), 200).decode(errors="replace") if heard else ""
     process.terminate()
     try:
@@ -100,8 +98,7 @@ def forget_files() -> None:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else "")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser = options(__doc__)
     parser.add_argument("--cold", action="store_true")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
     args = parser.parse_args()
@@ -120,9 +117,7 @@ def main() -> None:
     print(
         f"slowest: {worst['command']}, {worst['wall_s']:.2f} s; 1-minute load {os.getloadavg()[0]}"
     )
-    if args.json is not None:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
+    write(args.json, rows)
 
 
 if __name__ == "__main__":

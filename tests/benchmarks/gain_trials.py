@@ -1,6 +1,6 @@
 """Gains of current-driven joints: simulated ones with a known mass and without, over seeds.
 
-    python tests/benchmarks/gain_trials.py [--seeds 12] [--seconds 30]
+    python tests/benchmarks/gain_trials.py [--seeds 12] [--seconds 30] [--json FILE]
 
 Prints the largest error of the six gains of every seed, in %, and how far it lies in standard
 deviations; then the same against the documented masses alone, whose scale is hidden.
@@ -8,19 +8,15 @@ deviations; then the same against the documented masses alone, whose scale is hi
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
 from adapter.gap.torque_gains import learn_gains
+from tests.helpers.benchmark import options, write
 from tests.helpers.driven_arm import LOAD_KG, currents, driven_arm, six_joints
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=12)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    args = parser.parse_args()
+    args = options(__doc__, seeds=12, seconds=30.0).parse_args()
     worst = []
     for seed in range(args.seeds):
         hidden = driven_arm(seed)
@@ -38,6 +34,7 @@ def main() -> None:
             f"{alone.shown.sum()} of {len(off)} shown, scale open: {alone.load_kg is None}",
             flush=True,
         )
+    write(args.json, worst)
     print(f"known mass: worst {max(worst):.2f} %, within 2 %: {sum(x < 2.0 for x in worst)}")
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from adapter.gap.workflow import find_gap
 from drivers.files.mcap import Log
 from tests.helpers.benchmark import in_processes, options
 from tests.helpers.gap_mujoco import mujoco_recording
@@ -36,15 +37,8 @@ Analyse = Callable[..., Any]
 Judge = Callable[[Trial, Log, dict[str, Any], Path], Row]
 
 
-def workflow() -> Analyse:
-    """The function under trial."""
-    from adapter.gap.workflow import find_gap
-
-    return find_gap
-
-
-def run_trial(trial: Trial, simulator: str, find_gap: Analyse, judges: Sequence[Judge] = ()) -> Row:
-    """Record, find_gap and score one trial."""
+def run_trial(trial: Trial, simulator: str, analyse: Analyse, judges: Sequence[Judge] = ()) -> Row:
+    """Record, analyse as `find_gap` does and score one trial."""
     recording = SIMULATORS[simulator](trial)
     with tempfile.TemporaryDirectory() as folder:
         shown, kept = Path(folder) / "shown", Path(folder) / "kept"
@@ -52,7 +46,7 @@ def run_trial(trial: Trial, simulator: str, find_gap: Analyse, judges: Sequence[
         log, model, truth = write(trial, kept, recording, simulator)
         log, model = (path.rename(shown / path.name) for path in (log, model))
         begun = time.perf_counter()
-        answer = find_gap([log], model, model_out=shown / "model.json")
+        answer = analyse([log], model, model_out=shown / "model.json")
         seconds = time.perf_counter() - begun
         result: dict[str, Any] = answer if isinstance(answer, dict) else answer.as_dict()
         row = score_trial(result, json.loads(truth.read_text()), detectability(trial))
@@ -73,7 +67,7 @@ def _job(job: Job) -> Row:
     judges = (torque_judge,) if judged else ()
     maker = simulator or BY_SEED[seed % len(BY_SEED)]
     try:
-        return run_trial(draw(seed, kind, effect, None, motion, sticks), maker, workflow(), judges)
+        return run_trial(draw(seed, kind, effect, None, motion, sticks), maker, find_gap, judges)
     except Exception:
         return {"seed": seed, "failed": traceback.format_exc()}
 

@@ -18,10 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adapter.gap.workflow import find_gap
-from tests.helpers.benchmark import Row, in_processes, options, told
+from tests.helpers.benchmark import Row, in_processes, options, share_of, told
 from tests.helpers.gap_effects import rnea, sense
 from tests.helpers.gap_mujoco import simulate
-from tests.helpers.gap_scorer import wilson
 from tests.helpers.gap_tools import recorded
 from tests.hidden import Trial, draw, nominal_urdf
 from tests.hidden.record import write_files
@@ -175,10 +174,7 @@ def summary(rows: Sequence[Row]) -> list[str]:
         ("its coefficient, of those", [r["coefficient"] for r in within if r["form"]]),
         ("a law on another joint, or where none is", [r["false"] > 0 for r in rows]),
     ]
-    said = []
-    for what, hits in lines:
-        low, high = wilson(sum(hits), len(hits))
-        said.append(f"{what}: {sum(hits)} of {len(hits)} ({low:.0%} to {high:.0%})")
+    said = [share_of(*line) for line in lines]
     over = np.quantile([r["over_floor"] for r in rows], [0.5, 0.9])
     return [*said, f"held out, over the noise: {over[0]:.2f} (median), {over[1]:.2f} (90 %)"]
 

@@ -75,6 +75,7 @@ JOINT = """<joint name="{0}" type="revolute"><parent link="l{1}"/>
 JOINTS = enumerate(("shoulder", "elbow", "wrist"), 1)  # of the recordings
 PARTS = [LINK.format(0, 4), *(LINK.format(k, 3) + JOINT.format(x, k - 1, k) for k, x in JOINTS)]
 URDF = ('<robot name="arm">' + "".join(PARTS) + "</robot>").encode()
+CSV = b"time,q,dq,tau\n" + b"".join(b"%.3f,1.5,2e-3,-7\n" % (1e-3 * k) for k in range(20))
 NUMBERS = (0, 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
 Refusals = tuple[type[BaseException], ...]
 
@@ -228,7 +229,6 @@ def files(folder: Path) -> dict[str, Decoder]:
     save_checkpoint(learner_for(), folder / "c.npz")
     toml = b"gravity = [9.81, 0.0, 0.0]\n[tool]\nmass = 0.73\ncom = [0.0, 0.0, 0.06]\n"
     toml += b"[pipeline.filter]\nbandwidth_hz = 6.0\n[excitation]\nseed = 3\n"
-    csv = b"time,q,dq,tau\n" + b"".join(b"%.3f,1.5,2e-3,-7\n" % (1e-3 * k) for k in range(20))
 
     def at(name: str, read: Callable[[Path], object]) -> Callable[[bytes], object]:
         def from_file(data: bytes) -> object:
@@ -256,7 +256,7 @@ def files(folder: Path) -> dict[str, Decoder]:
         "toml": Decoder([toml], at("x.toml", read_config), (SettingsError,), 0.03, True),
         "mjcf": Decoder([MJCF], at("x.xml", read_robot), wrong, 0.003, True),
         "cell": Decoder([CELL], at("c.toml", read_config), (SettingsError,), 0.03, True),
-        "csv": Decoder([csv], at("x.csv", read_table), driver, 0.03, True),
+        "csv": Decoder([CSV], at("x.csv", read_table), driver, 0.03, True),
         "npz": Decoder(
             [table.read_bytes(), (folder / "u.npz").read_bytes()],
             at("x.npz", read_npz),
@@ -313,7 +313,6 @@ def commands(folder: Path) -> dict[str, Decoder]:
     (folder / "a.urdf").write_bytes(URDF)
     arm, kept = str(folder / "a.urdf"), ("--no-report", "--quiet", "--out", str(folder / "out"))
     log = foreign(folder / "b.mcap", payloads(samples(40))).read_bytes()
-    csv = b"time,q,dq,tau\n" + b"".join(b"%.3f,1.5,2e-3,-7\n" % (1e-3 * k) for k in range(20))
     columns = ("--columns", "time=0,q=1,dq=2,tau=3", "--to", str(folder / "to.mcap"))
 
     def answered(*words: str) -> int:
@@ -340,7 +339,7 @@ def commands(folder: Path) -> dict[str, Decoder]:
         "info MODEL": (model, given("x.json", "info", "FILE"), True),
         "export": (model, given("x.json", "export", "FILE", "--urdf", out), True),
         "diff": (urdf, given("x.urdf", "diff", "panda", "FILE"), True),
-        "import": (csv, given("x.csv", "import", "FILE", *columns, "--joints", "a"), True),
+        "import": (CSV, given("x.csv", "import", "FILE", *columns, "--joints", "a"), True),
         "recover": (log, given("x.mcap", "recover", "FILE", *mended), False),
         "gap ROBOT": (URDF, given("x.urdf", "gap", str(folder / "b.mcap"), "--robot", "FILE",
                                   "--quiet", "--out", str(folder / "gap")), True),

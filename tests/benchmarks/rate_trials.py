@@ -39,7 +39,7 @@ from drivers.interface import Array, JointSample
 from sim.plant import SimulatedArm
 from sim.scenarios import build
 from tests.helpers.arm_data import panda_model
-from tests.helpers.benchmark import options, told
+from tests.helpers.benchmark import options, told, with_columns
 
 RATES = (1000, 500, 250, 125, 60, 30)
 REST_S = 1.5  # of each rest
@@ -103,13 +103,8 @@ def least_squares(log: Log, until_s: float, robot: SelfModel) -> Array:
         q, dq, ddq, tau = smooth(seconds(part), part.q, part.dq, part.tau)
         edge = round(EDGE_S / GRID_S)
         q, dq, ddq, tau = (x[edge:-edge:ROW_EVERY] for x in (q, dq, ddq, tau))
-        m, n = q.shape
-        X = np.zeros((m, n, 14 * n))
-        X[:, :, : 10 * n] = regressor(robot, q, dq, ddq)
-        for k, column in enumerate((dq, np.tanh(dq / 0.02), np.ones_like(q), ddq)):
-            for j in range(n):
-                X[:, j, (10 + k) * n + j] = column[:, j]
-        return X, tau
+        own = dq, np.tanh(dq / 0.02), np.ones_like(q), ddq
+        return with_columns(regressor(robot, q, dq, ddq), own), tau
 
     early = seconds(log) < until_s
     (X, tau), (held, other) = rows(log.take(early)), rows(log.take(~early))

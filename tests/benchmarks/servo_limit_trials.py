@@ -1,6 +1,6 @@
 """Torque limits, dead bands, backlash, static friction of position-controlled arms: named?
 
-    python tests/benchmarks/servo_limit_trials.py KIND [--seeds 12] [--first 0]
+    python tests/benchmarks/servo_limit_trials.py KIND [--seeds 12] [--first 0] [--json FILE]
 
 KIND is limit, dead, backlash or stiction. Each seed is a simulated Panda of `servo_trials.py` with
 one such effect in two joints: a dead band of 2 to 10 mrad, backlash of 2 to 20 mrad, friction that
@@ -11,7 +11,6 @@ motion does not reach, which its noise-free asked torque tells, are not counted.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from adapter.effects.robots import read_robot
 from adapter.gap.servo import explain
+from tests.helpers.benchmark import options, write
 from tests.helpers.position_arm import Drawn, PositionArm, as_log, errors, named, position_arm
 
 EFFECTS = {
@@ -60,10 +60,8 @@ def drawn(kind: str, seed: int) -> tuple[PositionArm, list[int]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, seeds=12, first=0)
     parser.add_argument("kind", choices=tuple(EFFECTS))
-    parser.add_argument("--seeds", type=int, default=12)
-    parser.add_argument("--first", type=int, default=0)
     args = parser.parse_args()
     panda, effect, rows = read_robot("panda"), EFFECTS[args.kind], []
     for seed in range(args.first, args.first + args.seeds):
@@ -80,6 +78,7 @@ def main() -> None:
         wrong = sorted(told - arm.expected)
         others = {(e, j) for e, j in arm.expected if e != effect}
         rows.append((right, len(joints), close, len(wrong), len(told & others), len(others)))
+        write(args.json, rows)
         print(
             f"seed {seed}: {right} of {len(joints)}, within 10 % {close}, wrong {wrong}", flush=True
         )

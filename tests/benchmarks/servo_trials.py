@@ -1,6 +1,6 @@
 """Position-controlled arms without torque: servos named, their numbers, unseen motion; and nulls.
 
-    python tests/benchmarks/servo_trials.py [--seeds 12] [--first 0] [--seconds 20]
+    python tests/benchmarks/servo_trials.py [--seeds 12] [--first 0] [--seconds 20] [--json FILE]
 
 Each seed is a simulated Panda with its own servos, delay, friction and armature, as documented and
 with bodies 2 % off. It is fitted on sines and foretells a motion from point to point; then its true
@@ -10,7 +10,6 @@ servos are given as documentation, and nothing is to be named. MuJoCo alone step
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
@@ -20,16 +19,13 @@ from adapter.gap.servo import explain
 from adapter.gap.servo_files import servo_mjcf
 from adapter.gap.servo_signals import Track
 from adapter.model.self_model import Limits
+from tests.helpers.benchmark import options, write
 from tests.helpers.position_arm import Drawn, as_log, errors, named, position_arm
 from tests.helpers.position_mujoco import error_in_mujoco
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=12)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    args = parser.parse_args()
+    args = options(__doc__, seeds=12, first=0, seconds=20.0).parse_args()
     panda, rows = read_robot("panda"), []
     free = replace(panda, limits=Limits.unknown(panda.tree.n))  # as the simulated motors are
     for seed in range(args.first, args.first + args.seeds):
@@ -61,6 +57,7 @@ def main() -> None:
                     float(there.max()),
                 )
             )
+            write(args.json, rows)
             told = ", ".join(f"{e} {100.0 * x:.1f} %" for e, x in worst.items())
             print(
                 f"seed {seed}, masses {'2 % off' if rows[-1][0] else 'right'}, {1 / period:.0f} Hz,"

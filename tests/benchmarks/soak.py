@@ -25,11 +25,8 @@ EVERY_S, SETTLED_S = 5.0, 60.0
 SHORTEST_S = 30.0  # of a run that is begun again
 EXIT_ARM = 3  # of `adapter run`: the arm failed, or tripped because the machine was away
 READY_S = 120.0
-# Faults of the wire that come as a share of the messages, by simulated arm.
-FAULTS = {
-    "fci": ("drop", "late", "repeat", "reorder", "corrupt"),
-    "can": ("drop", "late", "repeat", "reorder", "corrupt"),
-}
+# Faults of the wire, of either simulated arm, that come as a share of the messages.
+FAULTS = ("drop", "late", "repeat", "reorder", "corrupt")
 READY = {"fci": re.compile(r"127\.0\.0\.1:\d+"), "can": re.compile(r"can://\S+")}
 
 
@@ -63,7 +60,7 @@ def simulated(
     command += ["--port", "0"] if arm == "fci" else []
     command += extra
     if share:
-        for name in FAULTS[arm]:
+        for name in FAULTS:
             command += ["--fault", f"{name}={share}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:

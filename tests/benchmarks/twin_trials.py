@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from adapter.gap.workflow import find_gap
 from drivers.files.mcap import Log
 from sim.truth import Truth
-from tests.helpers.benchmark import Row, in_processes, options, told
+from tests.helpers.benchmark import Row, in_processes, options, share_of, told, with_columns
 from tests.helpers.gap_effects import regressor, rnea
-from tests.helpers.gap_scorer import wilson
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
 from tests.hidden.record import write_files
 from tests.hidden.trial import nominal_urdf
@@ -63,16 +63,10 @@ def weighed(recording: Log, nominal: Truth) -> float:
     inner = slice(int(0.05 * len(q)), int(0.95 * len(q)), KEPT)
     q, dq, ddq, tau = (x[inner] for x in (q, dq, ddq, tau))
     rest = tau - rnea(nominal, q, dq, ddq)
-    m, n = rest.shape
+    n = rest.shape[1]
     load = regressor(nominal, q, dq, ddq)[:, :, -10:]
-    columns = np.zeros((m, n, 10 + 3 * n))
-    columns[:, :, :10] = load
-    for j in range(n):
-        own = 10 + 3 * j
-        columns[:, j, own : own + 3] = np.stack(
-            [np.tanh(dq[:, j] / REST_WIDTH), dq[:, j], np.ones(m)], axis=1
-        )
-    information = np.diag(np.concatenate([PRIOR**-2.0, np.tile([1.0, 1.0, 1.0], n)]))
+    columns = with_columns(load, (np.tanh(dq / REST_WIDTH), dq, np.ones_like(dq)))
+    information = np.diag(np.concatenate([PRIOR**-2.0, np.ones(3 * n)]))
     weight, x = np.ones(n), np.zeros(10 + 3 * n)
     for _ in range(ROUNDS):
         A = information + np.einsum("mji,j,mjk->ik", columns, weight, columns)
@@ -83,8 +77,6 @@ def weighed(recording: Log, nominal: Truth) -> float:
 
 def run(seed: int) -> Row:
     """One twin: what `find_gap` says of it, and what least squares weighs."""
-    from adapter.gap.workflow import find_gap
-
     twin = draw_twin(seed)
     recording = (by_mujoco if seed % 2 else by_pinocchio)(twin)
     row: Row = {**twin.as_dict(), "weighed_kg": weighed(recording, twin.nominal)}
@@ -134,10 +126,7 @@ def summary(rows: list[Row]) -> list[str]:
         ("another wrong name", [m["wrong"] for m in marks]),
         ("refused", [m["refused"] for m in marks]),
     ]
-    said = []
-    for what, hits in lines:
-        low, high = wilson(sum(hits), len(hits))
-        said.append(f"{what}: {sum(hits)} of {len(hits)} ({low:.0%} to {high:.0%})")
+    said = [share_of(*line) for line in lines]
     off = [abs(r["weighed_kg"] - r["load_kg"]) for r in rows]
     said.append(f"least squares is off by {np.median(off):.2f} kg (median), {max(off):.2f} at most")
     return said

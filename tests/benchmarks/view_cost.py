@@ -28,7 +28,7 @@ from soak import family
 
 from adapter.realtime.shared import SHM_FOLDER, SharedBlock
 from adapter.realtime.timing import BLOCK_BYTES, LoopBoard, LoopTiming
-from tests.helpers.benchmark import options, write
+from tests.helpers.benchmark import options, processor_s, write
 from tests.helpers.browser import Tab, tab
 
 SETTLE_S, EDGE_S = 4.0, 1.5  # after the first frame, and after each change of what is shown
@@ -37,18 +37,6 @@ START_S = 180.0
 WATCHED = ("loop_us", "tick_us", "lateness_us")
 SHARES = (50.0, 99.0)
 EMPTY = "about:blank"
-
-
-def processor_s(pids: list[int]) -> float:
-    """Processor time that processes have used."""
-    total = 0.0
-    for pid in pids:
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return total
 
 
 @contextmanager

@@ -8,7 +8,6 @@ drops and the milliseconds in which the machine stood still counted apart.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import threading
@@ -22,6 +21,7 @@ import numpy as np
 from soak import simulated
 
 from adapter.realtime.real_time import Clock, RealTime, split_cores
+from tests.helpers.benchmark import options, write
 
 SHARES = (50, 99, 99.9, 100)
 FRESH_NS = 1_000_000
@@ -187,13 +187,11 @@ def can_udp(minutes: float) -> dict[str, Any]:
 
 def main() -> None:
     """Measure what was asked for; print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, minutes=0.5)
     kinds = ("fci", "virtual", "udp")
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(kinds)}")
-    parser.add_argument("--minutes", type=float, default=0.5)
     parser.add_argument("--protocol", type=int, choices=(5, 10), default=5)
     parser.add_argument("--quiet-machine", action="store_true", help="no busy thread beside fci")
-    parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     found: dict[str, Any] = {}
     for kind in args.kinds or kinds:
@@ -206,8 +204,7 @@ def main() -> None:
         else:
             parser.error(f"no kind '{kind}'; have: {', '.join(kinds)}")
         print(kind, json.dumps(found[kind], indent=1), flush=True)
-    if args.json is not None:
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
+    write(args.json, found)
 
 
 if __name__ == "__main__":

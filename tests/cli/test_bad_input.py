@@ -158,11 +158,6 @@ def test_no_page_stays_beside_a_model_that_it_does_not_describe(tmp_path, capsys
     assert (out / "model.json").exists() and not (out / "report.html").exists()
 
 
-def test_models_of_different_joints_are_not_compared(tmp_path, refused) -> None:
-    said = refused("diff", "panda", with_gripper(tmp_path))
-    assert "different trees" in said and "--lock JOINT=VALUE takes one away" in said
-
-
 def test_times_count_from_the_recordings_start(tmp_path, capsys) -> None:
     """Not from the year 1970, from which robots and ROS count."""
     began = 1_700_000_000_000_000_000

@@ -76,7 +76,6 @@ def test_makes_the_motion_that_a_gap_report_asks_for(tmp_path, capsys):
         (["--at", "0,1.5,0,-0.2,0,1.5,0"], "no motion can start at 0.00, 1.50"),
         (["--std", "0"], "--std must be above 0"),
         (["--gap", LOG], "not the JSON of `adapter gap`"),
-        (["--move", "elbow"], "no joint 'elbow' to move"),
     ],
 )
 def test_wrong_use_is_one_sentence(options, said, tmp_path, refused):

@@ -81,7 +81,6 @@ def test_without_pyarrow_a_csv_table(
     ("arguments", "said"),
     [
         ((), "give LOGs, or --out"),
-        (("none.mcap",), "no recording there"),
         ((RECORDING, "--forget", RECORDING), "--forget needs --out"),
         ((RECORDING, "--manifest", "none.csv"), "none.csv"),
     ],

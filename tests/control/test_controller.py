@@ -25,10 +25,16 @@ MS = 1_000_000
 
 
 class Floating:
-    """What a controller has to know of an arm that carries its own weight."""
+    """What a controller has to know of an arm that carries its own weight.
 
-    paced, adds_gravity, period_ns, arrived_ns, delay_ns = True, True, MS, 1, MS
+    It acts upon a command `delay_ns` after the sample.
+    """
+
+    paced, adds_gravity, period_ns, arrived_ns = True, True, MS, 1
     joint_names = PANDA.tree.joint_names
+
+    def __init__(self, delay_ns: int = MS) -> None:
+        self.delay_ns = delay_ns
 
 
 def _sample(k: int, q=READY, tau=None) -> JointSample:
@@ -45,13 +51,6 @@ def test_the_first_command_is_what_the_arm_holds_itself_with():
     np.testing.assert_array_equal(floating.step(_sample(0)), np.zeros(7))
 
 
-class Late(Floating):
-    """An arm that acts upon a command so long after the sample."""
-
-    def __init__(self, delay_ns: int) -> None:
-        self.delay_ns = delay_ns
-
-
 @pytest.mark.parametrize(
     ("delay_ns", "share"), [(0, 1.0), (MS // 2, 1.0), (MS, 1.0), (2 * MS, 0.5), (5 * MS, 0.2)]
 )
@@ -59,7 +58,7 @@ def test_damping_is_as_gentle_as_the_arm_is_late(delay_ns: int, share: float) ->
     damping = np.linspace(1.0, 7.0, 7)
     gains = ControlSettings(stiffness=np.zeros(7), damping=damping)
     controller = ExcitationController(LIMITS, control=gains)
-    controller.attend(Late(delay_ns))
+    controller.attend(Floating(delay_ns))
     controller.prepare(_sample(0))
     controller.step(_sample(0), 1)
     dq = np.array([0.1, -0.1] * 3 + [0.1])
@@ -90,7 +89,7 @@ def test_commands_end_at_the_effort_and_step_no_further_than_the_rate(sign: floa
     for instants, most in ((True, 0.9), (False, 1.0)):
         patient = ControlSettings(safety=SafetySettings(saturated_s=1.0))
         controller = ExcitationController(LIMITS, None, patient, Always(sign * 1e4))
-        controller.attend(Late(MS))
+        controller.attend(Floating())
         controller._adds_gravity = False  # the model's torque as it is
         controller.prepare(_sample(0, tau=np.zeros(7)))
         way = []

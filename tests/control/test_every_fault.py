@@ -180,8 +180,10 @@ ROTATION_RAD, POSITION_M = 1e-3, 1e-3
 ALL_AT_ONCE = "lost=0.01,late=0.01,repeated=0.01,reordered=0.01,corrupt=0.01,nan=0.01,spike=0.01"
 
 
-def check(run: FaultRun) -> None:
-    """The run went to its end, all is accounted for, and the parameters agree."""
+def test_parameters_agree_with_every_fault_at_once() -> None:
+    """The run goes to its end, all is accounted for, and the parameters agree."""
+    run = run_faulty(ALL_AT_ONCE, LONG_S)
+    assert min(run.driver.account.injected.values()) > 50
     assert (run.result.ended, run.result.fault) == ("duration", None)
     run.check_balance()
     assert run.watched.finite and not run.learner.changes
@@ -190,12 +192,6 @@ def check(run: FaultRun) -> None:
     assert apart.torque < TORQUE_STD, apart
     assert apart.error_ratio < ERROR_RATIO, apart
     assert apart.rotation_rad < ROTATION_RAD and apart.position_m < POSITION_M, apart
-
-
-def test_parameters_agree_with_every_fault_at_once() -> None:
-    run = run_faulty(ALL_AT_ONCE, LONG_S)
-    assert min(run.driver.account.injected.values()) > 50
-    check(run)
 
 
 def test_the_check_can_fail() -> None:

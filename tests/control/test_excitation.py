@@ -34,18 +34,10 @@ READY = build("nominal").truth.ready
 NUMBERS = r"([+-][\d.]+) \.\. ([+-][\d.]+) rad .* at first ([\d.]+), then ([\d.]+) rad/s"
 
 
-def _starts(draw_share):
-    start = LIMITS.lower + np.array(draw_share) * (LIMITS.upper - LIMITS.lower)
-    return np.minimum(start, LIMITS.upper)  # rounding may lead a last bit beyond
-
-
-shares = st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7)
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
-    share=shares,
+    share=st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7),
     stop_s=st.floats(0.0, 8.0),
     rest=st.one_of(st.none(), st.floats(0.0, 3.0)),
     slow=st.one_of(st.just(0.0), st.floats(1.0, 4.0)),
@@ -56,7 +48,8 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(
 ):
     shift = 0.0 if slow == 0.0 else slow + 1.0  # no rest while it becomes quicker
     rests = () if rest is None else ((shift + rest, shift + rest + 1.5),)
-    start = _starts(share)
+    start = LIMITS.lower + np.array(share) * (LIMITS.upper - LIMITS.lower)
+    start = np.minimum(start, LIMITS.upper)  # rounding may lead a last bit beyond
     how = ExcitationSettings(seed=seed, rests=rests, slow_s=slow, slow_share=slow_share)
     motion = RandomMotion(LIMITS, start, how)
     q, dq, ddq = played(motion, stop_s, DT)
@@ -121,7 +114,7 @@ def test_a_plan_says_how_far_how_fast_and_how_to_stop():
 
 
 def test_is_rich_and_does_not_repeat():
-    motion = RandomMotion(LIMITS, build("nominal").truth.ready, ExcitationSettings(seed=3))
+    motion = RandomMotion(LIMITS, READY, ExcitationSettings(seed=3))
     path = []
     for _ in range(30_000):
         motion.advance(1e-2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import resources
 from itertools import combinations
 
 import numpy as np
@@ -21,6 +20,7 @@ from adapter.model.robots import documented
 from adapter.model.urdf import model_from_urdf
 from adapter.runs.config import config_from, config_table
 from sim.scenarios import build
+from tests.helpers.robot_models import PANDA as PANDA_URDF
 
 pytest.importorskip("coal")
 PANDA = documented("panda")
@@ -157,10 +157,9 @@ def test_an_arm_of_ones_own_gets_its_shapes_from_its_file():
 
 
 def test_a_panda_with_a_hand_in_its_file_needs_room_for_it():
-    folder = resources.files("adapter") / "model" / "robots"
     hand = '<link name="hand"/><joint name="h" type="fixed"><parent link="panda_link8"/>'
     hand += '<child link="hand"/><origin xyz="0 0 0.1"/></joint></robot>'
-    model = model_from_urdf((folder / "panda.urdf").read_text().replace("</robot>", hand))
+    model = model_from_urdf(PANDA_URDF.read_text().replace("</robot>", hand))
     assert len(bodies_of(model)) == len(bodies_of(PANDA)) + 1
 
 

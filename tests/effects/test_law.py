@@ -295,9 +295,8 @@ def drag() -> Iterator[Drag]:
 def stirring(seconds: float) -> ArmData:
     """A recording of an arm with drag on one joint."""
     data = record(arm(), Motion(seconds, seed=4))
-    dq, tau = data.true[1], data.tau.copy()
-    tau[:, J] += C * dq[:, J] * np.abs(dq[:, J])
-    return replace(data, tau=tau)
+    dq = data.true[1]
+    return replace(data, tau=data.tau + C * dq * np.abs(dq) * np.eye(N)[J])
 
 
 def with_drag() -> SelfModel:

@@ -26,6 +26,7 @@ from drivers.files.mcap import Log
 from drivers.interface import JointSample, LinkMotion
 from sim.dynamics import link_motion
 from sim.effects import Effect, per_joint
+from sim.scenarios import build
 from sim.truth import Truth, facts_of, panda
 
 PERIOD_S = 1e-3
@@ -288,6 +289,12 @@ def rubbing(Fc: float, Fv: float) -> Truth:
 def arm() -> Truth:
     """The documented Panda as the simulator knows it; one object, so that `record` is cached."""
     return panda()
+
+
+@cache
+def bent(seed: int) -> Truth:
+    """A Panda whose frames are not the documented ones; one object a seed, likewise."""
+    return build("bent_link", seed).truth
 
 
 @cache

@@ -1,15 +1,19 @@
-"""What the command lines of `tests/benchmarks` share: options, rows that are told and written."""
+"""What the command lines of `tests/benchmarks` share: options, rows told and written, shares."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from tests.helpers.gap_scorer import wilson
 
 Row = dict[str, Any]
 HELP = {"first": "first seed"}
@@ -47,6 +51,29 @@ def told(
         print(line(row), flush=True)
         write(path, found)
     return found
+
+
+def processor_s(pids: list[int]) -> float:
+    """Processor time that processes have used."""
+    total = 0.0
+    for pid in pids:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return total
+
+
+def share_of(what: str, hits: Sequence[bool]) -> str:
+    """How many of so many, with the 95 % interval of their share."""
+    low, high = wilson(sum(hits), len(hits))
+    return f"{what}: {sum(hits)} of {len(hits)} ({low:.0%} to {high:.0%})"
+
+
+def with_columns(Y: np.ndarray, own: Iterable[np.ndarray]) -> np.ndarray:
+    """A regressor (m, n, p) with more columns, each (m, n) of a parameter that each joint has."""
+    return np.concatenate([Y, *(x[:, :, None] * np.eye(Y.shape[1]) for x in own)], axis=2)
 
 
 def in_processes(run: Callable[[Any], Row], jobs: Iterable[Any], count: int) -> Iterator[Row]:

@@ -108,20 +108,21 @@ addEventListener("load", () => {
 """
 
 
-def laid_out(page: str, folder: Path, width: int) -> dict[str, Any]:
-    """How a page of that width lies in headless Chromium, with everything unfolded.
+def laid_out(page: str, folder: Path, width: int) -> int:
+    """Assert that a page lies within a width in Chromium, everything unfolded; cells of its tables.
 
-    Of the answer `wide` is the width, `scrolls` by how much the page is wider, `outside` what
-    reaches over its right edge or over that of what a table scrolls in, `lost` cells of tables
-    without any area, `cells` how many there are. The page runs in a frame, for no window can be
-    so narrow.
+    Nothing scrolls or reaches over the right edge of the page or of what a table scrolls in, and
+    no cell is without area. The page runs in a frame, for no window can be so narrow.
     """
     outer = MEASURE.replace("WIDTH", str(width)).replace("FOUND", FOUND)
     text = outer.replace("PAGE", html.escape(page))
     done = _chromium(text, folder, "--virtual-time-budget=4000", "--dump-dom")
     answer = re.search(rf"{FOUND}(.*?)</pre>", done.stdout)
     assert answer is not None, done.stderr
-    return dict(json.loads(html.unescape(answer[1])))
+    found = json.loads(html.unescape(answer[1]))
+    assert found["wide"] <= width and found["scrolls"] <= 0
+    assert found["outside"] == [] and found["lost"] == []
+    return int(found["cells"])
 
 
 def shown_without_complaint(

@@ -18,7 +18,7 @@ from tests.helpers.gap_effects import Array, sense
 from tests.hidden import Trial, draw
 from tests.hidden.motion import DrawnMotion, draw_motion
 from tests.hidden.record import log_of
-from tests.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
+from tests.hidden.sizes import log_uniform, wrist_shares
 from tests.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM
 
 NOISE_STREAM = 1 << 35
@@ -33,13 +33,12 @@ def believed(seed: int) -> Trial:
     rng.random()
     theta = wrong_bodies(nominal.theta, 0.02, rng)
     motion = draw_motion(rng, nominal.limits, nominal.ready, "sines")
-    share = np.where(np.arange(1, nominal.n + 1) >= WRIST, WRIST_SHARE, 1.0)
     return replace(
         draw(seed, "null", rubs=False),
         arm=nominal.with_changes(theta=theta, ready=motion.middle),
         model_error=0.02,
         motion=motion,
-        disturbance_nm=share * rng.uniform(*DISTURBANCE_NM, nominal.n),
+        disturbance_nm=wrist_shares(nominal.n) * rng.uniform(*DISTURBANCE_NM, nominal.n),
         disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
     )
 

@@ -12,13 +12,13 @@ from adapter.model.spatial import log_rotation, matrix_from_zxz
 from adapter.physics.identifiability import FrameObservability, frame_observability
 from adapter.runs.outcome import collect, frame_errors, learned_model
 from adapter.signals.records import stamp_of
-from sim.scenarios import build
 from sim.truth import Truth
 from tests.helpers.arm_data import (
     LINK_TWIST_NOISE,
     ArmData,
     Motion,
     arm,
+    bent,
     learner_for,
     panda_model,
     record,
@@ -50,32 +50,24 @@ class Run:
         return float(self.time_s[last + 1]) if last + 1 < len(good) else np.inf
 
 
-def arm_of(kind: str, seed: int) -> Truth:
-    return arm() if kind == "synthesized" else bent(seed)
-
-
-@cache
-def bent(seed: int) -> Truth:
-    return build("bent_link", seed).truth
-
-
 def data_of(kind: str, seed: int) -> ArmData:
-    return record(arm_of(kind, seed), Motion(SECONDS, seed), links=kind == "measured")
+    truth = arm() if kind == "synthesized" else bent(seed)
+    return record(truth, Motion(SECONDS, seed), links=kind == "measured")
 
 
 def learn(data: ArmData, mode: str = "moments", seed: int = 0) -> Run:
     """Learn λ alone from a recording, sample by sample."""
     learner = learner_for(mode=mode, seed=seed)
     truth, model = data.truth, panda_model()
-    times, values = [], []
-    for state in states_of(data):
+    kept = []
+    for count, state in enumerate(states_of(data), 1):
         learner.learn_schema(state[None])
-        times.append(1e-9 * stamp_of(state))
-        values.append(learner.schema.lam if len(times) % 10 == 0 else None)
-    kept = [(t, v) for t, v in zip(times, values, strict=True) if v is not None]
+        if count % 10 == 0:
+            kept.append((1e-9 * stamp_of(state), learner.schema.lam))
+    times, values = (np.array(x) for x in zip(*kept, strict=True))
     seen = frame_observability(model.tree, truth.lam, model.gravity)
-    turn, shift = frame_errors(np.array([v for _, v in kept]), truth.lam, seen.freedom)
-    return Run(learner, truth, seen, np.array([t for t, _ in kept]), turn, shift)
+    turn, shift = frame_errors(values, truth.lam, seen.freedom)
+    return Run(learner, truth, seen, times, turn, shift)
 
 
 @cache

@@ -206,10 +206,8 @@ def test_noisy_signals_cost_no_more_than_with_true_frames(seed: int) -> None:
     assert found.min_eigenvalue > 0.0
 
 
-def test_bad_input_is_named() -> None:
-    model, data = samples(random_urdf(5, 23), True, 30, 23)
-    with pytest.raises(ModelError, match="not finite"):
-        row_factors(replace(data, tau=data.tau * np.nan), model.lam)
+def test_a_base_at_rest_needs_gravity() -> None:
+    _, data = samples(random_urdf(5, 23), True, 30, 23)
     with pytest.raises(ModelError, match="gravity"):
         signals = {"q": data.q, "dq": data.dq, "tau": data.tau[:, 6:]}
         fixed = {name: np.tile(x, (20, 1)) for name, x in signals.items()}
@@ -239,9 +237,3 @@ def test_branches_of_any_tree(seed: int) -> None:
     assert sorted(j for joints in found.values() for j in joints) == list(range(17))
     for joints in found.values():
         assert [parent[j] in joints for j in joints] == [False, *[True] * (len(joints) - 1)]
-
-
-def test_one_branch_for_an_arm() -> None:
-    tree = read_quietly(random_urdf(6, 3)).tree
-    chain = Tree((-1, 0, 1, 2), joint_names=tree.joint_names[:4])
-    assert list(branches(chain).values()) == [(0, 1, 2, 3)]

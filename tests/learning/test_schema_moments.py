@@ -51,22 +51,15 @@ class Data:
         v, w, a, dw = (torch.from_numpy(self.parent[:, k : k + 3]) for k in (0, 3, 6, 9))
         cross = torch.linalg.cross
         P = p.expand_as(w)
+        z = (w, v + cross(w, P), a + cross(dw, P) + cross(w, cross(w, P)))[ch]
         own = torch.from_numpy(self.child[:, (3, 0, 6)[ch] : (6, 3, 9)[ch]])
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         q, dq, ddq = (torch.from_numpy(x)[:, None] * axis for x in (self.q, self.dq, self.ddq))
         if self.slides:  # what the way along the axis makes, seen from the child
             spin, turning = (torch.from_numpy(self.child[:, k : k + 3]) for k in (3, 9))
             far = cross(turning, q) + cross(spin, cross(spin, q)) + 2.0 * cross(spin, dq) + ddq
-            own = own - (torch.zeros_like(q), dq + cross(spin, q), far)[ch]
-            return own - (w, v + cross(w, P), a + cross(dw, P) + cross(w, cross(w, P)))[ch] @ R
-        if ch == 0:
-            z = w
-            own = own - dq
-        elif ch == 1:
-            z = v + cross(w, P)
-        else:
-            z = a + cross(dw, P) + cross(w, cross(w, P))
-        return turn_z(torch.from_numpy(self.q), own) - z @ R
+            return own - (torch.zeros_like(q), dq + cross(spin, q), far)[ch] - z @ R
+        return turn_z(torch.from_numpy(self.q), own - dq if ch == 0 else own) - z @ R
 
     def moved(self, ch: int, x: torch.Tensor) -> torch.Tensor:
         """Residuals (3 m,) after a turn and shift x (6,) of the frame."""

@@ -107,17 +107,12 @@ def by_mujoco(path: Path, motion: Motion, names: Names, centres: Points) -> Answ
     oracle.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     oracle.dof_damping[:] = 0.0  # the file of the dressed robot has some, which stays in it
     data = mujoco.MjData(oracle)
-    for name in names:
-        joint = oracle.joint(name)
-        for place, at, values in zip(
-            (data.qpos, data.qvel, data.qacc),
-            (joint.qposadr, joint.dofadr, joint.dofadr),
-            motion,
-            strict=True,
-        ):
-            place[at] = values[name]
+    at, dofs = (
+        [getattr(oracle.joint(name), key)[0] for name in names] for key in ("qposadr", "dofadr")
+    )
+    data.qpos[at], data.qvel[dofs], data.qacc[dofs] = ([x[name] for name in names] for x in motion)
     mujoco.mj_inverse(oracle, data)
-    tau = np.array([data.qfrc_inverse[oracle.joint(name).dofadr[0]] for name in names])
+    tau = data.qfrc_inverse[dofs]
     bodies = {name: data.body(name) for name in centres}
     places = {x: b.xpos + b.xmat.reshape(3, 3) @ centres[x] for x, b in bodies.items()}
     return Answer(tau, places)

@@ -161,9 +161,8 @@ def test_gravity_tool_and_load_are_compared() -> None:
 
 
 def test_other_trees_are_refused() -> None:
-    with pytest.raises(
-        ModelError, match=r"different trees; joint names: panda_joint1, .*joint7 and"
-    ):
+    said = "different trees; joint names: panda_joint1, .*joint7 and.*--lock JOINT=VALUE takes one"
+    with pytest.raises(ModelError, match=said):
         compare(PANDA, locked(PANDA, {"panda_joint4": 0.0}))
     with pytest.raises(ModelError, match="its base floats"):
         compare(PANDA.with_base(True), PANDA.with_base(True))
@@ -181,7 +180,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], refused
     assert "the link behind it" in said.err and "0.7355 -> 1.236 kg" in said.err
     assert main(["diff", "panda", path, "--json", str(tmp_path / "diff.json")]) == 0
     assert json.loads((tmp_path / "diff.json").read_text())["hand_max_m"] == 0.0
-    assert "panda" in refused("diff", path, "pnada")
     assert "thumb" in refused("diff", path, "panda", "--lock", "thumb=1")
 
 

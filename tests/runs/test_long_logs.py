@@ -11,8 +11,6 @@ import scipy.linalg
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.learning.settings import LearnerSettings
-from adapter.model.robots import documented
-from adapter.model.self_model import SelfModel
 from adapter.runs import batch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.replay import (
@@ -29,14 +27,10 @@ from adapter.signals import validation
 from adapter.signals.matching import matching, most_moved
 from drivers.files.mcap import Log, mapped
 from drivers.interface import Array
+from tests.helpers.arm_data import panda_model
 from tests.helpers.long_arm import log_of
 
 SETTINGS = PipelineSettings(learner=LearnerSettings(effects=REAL_ARM_EFFECTS))
-
-
-@cache
-def panda() -> SelfModel:
-    return documented("panda")
 
 
 @cache
@@ -66,9 +60,9 @@ def information(found: Replay, like: Replay) -> tuple[Array, Array]:
 def test_every_kth_state_tells_what_all_tell(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """θ, its standard deviations and the noise, against all states of the same recording."""
     log = moving(12.0, seed)
-    thin = replay(log, panda(), SETTINGS, ReplayOptions(every=50))
+    thin = replay(log, panda_model(), SETTINGS, ReplayOptions(every=50))
     monkeypatch.setattr(batch, "PER_SAMPLE", 10**6)
-    dense = replay(log, panda(), SETTINGS, ReplayOptions(every=50))
+    dense = replay(log, panda_model(), SETTINGS, ReplayOptions(every=50))
     assert thin.outcome.learned == dense.outcome.learned
     (H, th), (G, other) = information(dense, dense), information(thin, dense)
     weights, vectors = np.linalg.eigh(H)
@@ -87,8 +81,8 @@ def test_every_kth_state_tells_what_all_tell(seed: int, monkeypatch: pytest.Monk
 def test_a_recording_in_a_file_teaches_what_it_teaches_in_memory(every: int) -> None:
     log = moving(3.0, 1)
     options = ReplayOptions(every, until_s=2.5)
-    ours = replay(in_file(log), panda(), SETTINGS, options)
-    theirs = replay(log, panda(), SETTINGS, options)
+    ours = replay(in_file(log), panda_model(), SETTINGS, options)
+    theirs = replay(log, panda_model(), SETTINGS, options)
     assert (ours.samples, ours.span_s) == (theirs.samples, theirs.span_s)
     for name in ("lam", "theta", "effects", "covariance", "score_trace"):
         assert np.array_equal(getattr(ours.outcome, name), getattr(theirs.outcome, name)), name
@@ -103,8 +97,8 @@ def test_held_out_error_by_windows_is_that_of_the_whole(monkeypatch: pytest.Monk
     log = log.take(kept)
     log.q[900], log.dq[900], log.tau[900] = log.q[899], log.dq[899], log.tau[899]
     log.stamp_ns[2_000] -= 5_000_000
-    ours = held_out_rms(in_file(log), panda(), SETTINGS)
-    theirs = held_out_rms(log, panda(), SETTINGS)
+    ours = held_out_rms(in_file(log), panda_model(), SETTINGS)
+    theirs = held_out_rms(log, panda_model(), SETTINGS)
     assert ours.value == pytest.approx(theirs.value, rel=1e-9)
 
 
@@ -118,7 +112,7 @@ def test_parts_of_a_recording_in_a_file() -> None:
         assert level == pytest.approx(noise_levels(log)[name], rel=0.1)
     assert len(most_moved(whole)) == len(log)
     mixed = replace(log, joint_names=tuple(reversed(log.joint_names)))
-    assert np.array_equal(matching(in_file(mixed), panda()).q, log.q[:, ::-1])
+    assert np.array_equal(matching(in_file(mixed), panda_model()).q, log.q[:, ::-1])
 
 
 def test_recordings_one_after_the_other_in_a_file() -> None:

@@ -21,8 +21,7 @@ from adapter.runs.score import theta_score
 from adapter.signals.matching import matching
 from drivers.files.mcap import read_log, write_log
 from drivers.interface import DriverError
-from sim.scenarios import build
-from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
+from tests.helpers.arm_data import ArmData, Motion, arm, bent, panda_model, record
 
 N = 7
 NAMES = tuple(f"panda_joint{k + 1}" for k in range(N))
@@ -30,14 +29,9 @@ RECORDINGS = Path(__file__).parents[2] / "recordings"
 
 
 def data(links: bool = False, seconds: float = 2.5) -> ArmData:
-    truth = bent() if links else arm()
+    truth = bent(2) if links else arm()
     found = record(truth, Motion(12.0 if not links else 4.0, 21), links=links)
     return found.part(seconds)
-
-
-@cache
-def bent():
-    return build("bent_link", 2).truth
 
 
 def settings(**learner) -> PipelineSettings:

@@ -85,12 +85,11 @@ def test_wrong_sensors_are_refused() -> None:
     assert not Imus(("a", "b"), (), 0, 1e-3).sensors
 
 
-def test_a_recording_of_another_tool_is_replayed(tmp_path, refused) -> None:
+def test_a_recording_of_another_tool_is_replayed(tmp_path) -> None:
     glued = record(0, (1, 3), 2.5, Parts(rate_hz=250.0, joints_hz=500.0))
     path = glued.write(tmp_path / "log.mcap", {1: "front", 3: "panda_link4"})
     given = ["replay", str(path), "--robot", "panda", "--every", "20", "--no-report", "--quiet"]
     given += ["--out", str(tmp_path / "out"), "--json", str(tmp_path / "out.json")]
-    assert "'elbow' is no moving link of panda" in refused(*given, "--imu", "/imu2=elbow")
     assert main([*given, "--imu", "/imu2=panda_link2", "--imu", "/imu4"]) in (0, 9)
     figures = json.loads((tmp_path / "out.json").read_text())
     assert figures["lambda"]["source"] == "measured"
