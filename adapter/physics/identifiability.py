@@ -28,6 +28,9 @@ BODY_SIZE = np.r_[1.0, np.full(3, 0.1), np.full(6, 0.01)]
 # that a URDF has upright to five digits, and no more, show nothing that a sensor could tell.
 LEAST_SHOWN = 1e-4
 
+# From such a share of a parameter's own direction that data show it is known, and learned, alone.
+SHOWN_ALONE = 0.99
+
 # Appends columns to the regressor: (q, dq, ddq), each (m, n), to (m, rows, k).
 ExtraColumns = Callable[[Array, Array, Array], Array]
 
