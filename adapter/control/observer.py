@@ -30,13 +30,13 @@ from adapter.effects.active import with_bodies
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import Frames, axis_line, borrowed, jit, momenta, place_frames
+from adapter.signals.bristles import LONGEST_S
 from drivers.interface import JointSample
 
 POLE = 2.0 * math.pi * 24.0  # rad/s, of each of the observer's two
 # Standard deviations, over all joints together, beyond which it is a contact; s over which the mean
 # has to fall below half of that until the contact is over.
 SIGMAS, HOLD_S = 8.0, 0.1
-LONGEST_S = 0.02  # a longer step of the stamps begins anew
 SLOW_S, NOISE_S = 0.3, 5.0  # what is slower is no noise; over which noise is measured
 AGO_NS, LONG_AGO_S = 15_000_000, 0.1  # readings before, between which a momentum's rate is taken
 WARM_UP_S = 1.0  # of noise before the first contact is believed

@@ -19,6 +19,7 @@ from enum import IntEnum
 import numpy as np
 
 from adapter.control.limits import MotionLimits
+from adapter.control.observer import SIGMAS
 from adapter.control.settings import SafetySettings
 from adapter.errors import ControlError
 from adapter.model.spatial import Array
@@ -27,7 +28,7 @@ from adapter.physics.kernels import jit
 OFFSET_S = 1.0  # over which a constant difference from the model is learned
 CALM = 0.5  # of a limit: below it the arm moves as expected
 ENDLESS = 1e9  # N m, of a joint whose limit nobody documented
-MOVING = 0.02  # rad/s, of one joint at least
+MOVING = 0.02  # rad/s, of one joint at least; of a slower one friction has no direction
 
 
 class Cause(IntEnum):
@@ -55,7 +56,6 @@ class Now(IntEnum):
 
 
 MOST, LEAST = len(Cause), len(Cause) + 1  # further rows of the limits: what `EXTERNAL` is between
-SIGMAS = 8.0  # of the standard deviation: as many as for a contact
 
 
 _WHAT = {

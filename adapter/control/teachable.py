@@ -11,6 +11,7 @@ from adapter.control.information import Expected, Information
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.timing import HOLE_PERIODS
 from drivers.files.mcap import Log
 from drivers.interface import DriverError
 
@@ -19,7 +20,6 @@ SHORT_S = 10.0  # of motion; periodic motions that show an arm take 10 s and mor
 RESTS = 0.05  # rad/s, a joint that is never faster rests
 REVERSALS = 2  # of a joint, from which on friction and offset come apart
 WANTED = 0.05  # of each parameter's usual size
-HOLE = 3.0  # steps of time, longer ones end a stretch
 SHORTEST = 30  # samples of a stretch that is used
 
 
@@ -111,7 +111,7 @@ def _smoothed(log: Log) -> tuple[list[Array], float]:
     cutoff_hz = min(CUTOFF_HZ, OF_RATE / period_s)
     every = max(1, round(0.5 / (cutoff_hz * period_s)))
     found = []
-    holes = np.flatnonzero(np.diff(seconds) > HOLE * period_s) + 1
+    holes = np.flatnonzero(np.diff(seconds) > HOLE_PERIODS * period_s) + 1
     for part in np.split(np.arange(len(stamps)), holes):
         if len(part) >= SHORTEST:
             table = _stretch(seconds[part], q[part], tau[part], period_s, cutoff_hz)

@@ -34,10 +34,10 @@ FREE = -1  # parent of a link that nothing in the recording carries
 ALLOWANCE = 1.3  # misfit over expected variance that noise levels known so roughly may show ...
 DEVIATIONS = 4.0  # ... and so many standard deviations of a mean square of the noise
 FREE_RATIO = 4.0  # a link goes free where all explain it worse than by so many noise variances
-FREE_PRIOR = -5.0  # log odds of a link whose carrier is not in the recording
-RIGID_PRIOR = -5.0  # log odds of a link without a joint of its own
+# Log odds of what is rare: a link whose carrier is not in the recording, one without a joint of its
+# own, a frame that does not turn about its z.
+RARE_PRIOR = -5.0
 MOST_FITTED = 48  # hypotheses of a link whose frame is fitted; with more of them nothing is decided
-MOUNT_PRIOR = -5.0  # log odds of a frame that does not turn about its z
 MOST_MOUNTED = 24  # pairs of a link that are fitted; with more of them nothing is decided
 MOST_KEPT = 200  # options of a link
 LOST = 18.0  # log odds below the best at which a hypothesis is dropped
@@ -178,7 +178,7 @@ def convention_options(
         at = int(s), int(i)
         score = scores.total(scores.ratios(link, {at: fits[at]})[0]) if at in fits else bound[at]
         joint = int(scores.joints[s])
-        score += RIGID_PRIOR if joint == NO_JOINT else 0.0
+        score += RARE_PRIOR if joint == NO_JOINT else 0.0
         if score >= worst:
             found.append(Option(link, joint, int(i), float(score)))
     return found
@@ -248,7 +248,7 @@ class Scores:
     def free_score(self) -> float:
         """What a link costs that nothing carries."""
         beyond = np.log(max(FREE_RATIO / self.tolerance, 1.5))
-        return FREE_PRIOR - 0.5 * float(len(self.excess) * self._worth() * beyond)
+        return RARE_PRIOR - 0.5 * float(len(self.excess) * self._worth() * beyond)
 
     def _worth(self) -> float:
         """Independent samples of a channel; what is no noise in one reaches into the others."""
@@ -290,7 +290,7 @@ def mounted_hypotheses(bodies: Bodies, misfit: dict[str, Array]) -> Hypotheses:
     scores.learn_excess({k: np.array([ratios[k] for ratios in best]) for k in bodies.channels})
     found = [convention_options(scores, j, kept[j], misfit) for j in range(bodies.links)]
     _add_mounted(found, scores, pairs, fits)
-    options = tuple(ranked(_best(o), scores, j, MOUNT_PRIOR) for j, o in enumerate(found))
+    options = tuple(ranked(_best(o), scores, j, RARE_PRIOR) for j, o in enumerate(found))
     return Hypotheses(bodies, options, scores.excess, True)
 
 
@@ -363,7 +363,7 @@ def _add_mounted(
             score = float(scores.total(_ratios(pairs, mirror, fits[mirror])))
             mounting = fits[mirror].parent
         if score >= worst:
-            found[at[1]].append(Option(at[1], at[0], at[2], score + MOUNT_PRIOR, mounting))
+            found[at[1]].append(Option(at[1], at[0], at[2], score + RARE_PRIOR, mounting))
 
 
 def _best(options: list[Option]) -> list[Option]:

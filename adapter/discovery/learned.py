@@ -15,10 +15,12 @@ from adapter.discovery.frames import in_joint_frame
 from adapter.discovery.hypotheses import Option
 from adapter.discovery.verdict import UNSEEN_BASE, Discovery
 from adapter.errors import ModelError
+from adapter.judgement.noise import LEAST_NM
 from adapter.learning.batch.schema import SchemaResult, schema_from_moments
 from adapter.learning.batch.theta_factors import row_factors, scales, system
 from adapter.learning.batch.theta_filling import filled_words
 from adapter.learning.batch.theta_solvers import consistent_theta, least_squares_theta
+from adapter.learning.imu_fit import LEAST_STD
 from adapter.learning.theta import PRIOR_STD, neutral_body
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import LAMBDA_MEASURED, SelfModel, gravity_down
@@ -26,9 +28,7 @@ from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
 from adapter.physics.identifiability import numerical_rank
 
-CHANNEL_NOISE_FLOOR = 1e-9  # rad/s, m/s, ...: keeps a link at rest from infinite weight
 ROUNDS = 3  # of weighting
-LEAST_TORQUE = 1e-4  # N m; no joint is trusted to be explained better
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ def learn(discovery: Discovery) -> LearnedTree:
     for k, variance in discovery.bodies.noise.items():
         moving = variance[variance > 0.0]
         size = np.median(moving) if len(moving) else 0.0
-        noise[k] = float(np.sqrt(size * excess.get(k, 1.0))) + CHANNEL_NOISE_FLOOR
+        # more than none at all: a link at rest must not get an infinite weight
+        noise[k] = float(np.sqrt(size * excess.get(k, 1.0))) + LEAST_STD
     schema = schema_from_moments(data, np.array(list(noise.values())))
     # neighbouring samples share their noise: the filter leaves fewer independent ones
     gain = np.sqrt(max(1.0, log.samples / log.noise_samples))
@@ -197,7 +198,7 @@ def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array, list[str]]:
     for _ in range(ROUNDS):  # weighted by what the round before left
         r, b = system(rows, std, bodies)
         theta[first:] = least_squares_theta(r, b, theta[first:]).theta
-        std = np.array([max(row.residual(theta), LEAST_TORQUE) for row in rows])
+        std = np.array([max(row.residual(theta), LEAST_NM) for row in rows])
     shown = numerical_rank(system(rows, std, bodies)[0])[1]
     arbitrary = filled_words(shown, data.tree.body_names[first:])
     # below, rows that hold θ to a neutral body, by how far links differ from one another

@@ -17,6 +17,7 @@ from scipy.signal import butter, sosfiltfilt
 from adapter.errors import SettingsError
 from adapter.model.spatial import Array
 from adapter.signals.filters import noise_from_samples
+from adapter.signals.recording import GAP_S, RESTING
 from drivers.files.mcap import Log
 
 CHANNELS = ("w", "dw", "v", "a")  # of link motion; the angular ones first
@@ -26,8 +27,6 @@ CUTOFF_SHARE = 0.2  # of the sample rate, the highest corner that is used
 ORDER = 4  # of the filter, run forwards and backwards
 KEPT_PER_CUTOFF = 4.0  # samples kept per period of the corner frequency
 SHORTEST_S = 0.5  # less motion than this decides nothing
-GAP_S = 0.05  # a longer silence of a sensor is not bridged
-RESTING = 0.02  # rad/s, a joint slower than this counts as resting
 ENCODER_STEP = 2.0 * np.pi / 2**14  # rad, coarser than any encoder at a joint of today
 
 

@@ -32,6 +32,7 @@ from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import frame_observability
 from adapter.runs.outcome import frame_errors
+from adapter.runs.replay import BETWEEN_NS
 from adapter.runs.terminal import console
 from sim.falls.data_set import Flight, data_set
 from sim.falls.fall import atlas
@@ -337,7 +338,6 @@ def _comparison(learners: Sequence[LearnerScores], arms: Sequence[LearnerScores]
 # --- the 1 kHz learner on the whole robot --------------------------------------------------------
 
 LOOK_EVERY = 5000  # samples between two looks at the errors
-PAUSE_NS = 1_000_000_000  # between two motions
 # Noise of signals behind a filter, standard deviations: rad, rad/s, rad/s² of joints; rad/s,
 # m/s², rad/s² of bodies; share of the torque's own spread.
 NOISE_Q, NOISE_DQ, NOISE_DDQ = 2e-5, 1e-3, 2e-2
@@ -422,7 +422,7 @@ def online_trial(
                     "shift_m": float(shift.max()),
                 }
                 history.append(where | held_out(learner, test))
-        clock_ns += round(1e6 * len(data)) + PAUSE_NS
+        clock_ns += round(1e6 * len(data)) + BETWEEN_NS
     started = learner.theta_started_ns
     late = 1e-3 * np.array(times_ns[len(times_ns) // 2 :])
     figures = {

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from adapter.judgement.noise import MEMORY_S, memory_s
+from adapter.judgement.noise import LEAST_NM, MEMORY_S, memory_s
 from adapter.model.spatial import Array
 
 
@@ -138,7 +138,6 @@ class Moments(Normal):
 
 
 BAND_HZ = 25.0  # samples a second
-LEAST_NM = 1e-4  # N m; no torque sensor is quieter
 
 
 @dataclass(frozen=True, eq=False)

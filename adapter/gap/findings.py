@@ -12,19 +12,20 @@ import numpy as np
 from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import HELD, KNOWN, WRONG_LINK
-from adapter.effects.law import OverSignals
+from adapter.effects.law import SIGNALS, OverSignals
 from adapter.effects.phrases import experiments
 from adapter.gap.candidates import Pattern, prior_log_odds, signal_of
-from adapter.gap.evidence import LEAST_NM, Carried, Moments, score
+from adapter.gap.evidence import Carried, Moments, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.laws import in_doubt
+from adapter.gap.real_arm import OFFSET, SPRING
 from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found, from_the_start
+from adapter.judgement.noise import LEAST_NM
 from adapter.model.spatial import Array
 from adapter.screening.readings import rms
 
-OFFSET, SPRING = "torque_offset", "joint_spring"
 ODD = 4.0  # standard deviations from which on a correction is a finding
 DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
@@ -210,7 +211,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     shifted = {
         e.candidate.joint
         for e, standing in zip(fit.named, found.standings, strict=True)
-        if e.candidate.effect.name == OFFSET and standing.chi2 > 4.0  # two standard deviations
+        if e.candidate.effect is OFFSET and standing.chi2 > 4.0  # two standard deviations
     }
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
@@ -258,12 +259,12 @@ def _with_rests(fit: Fit, findings: list[Finding]) -> list[Finding]:
     What any arm has are springs that rest at zero, and offsets (`real_arm`).
     """
     named = [e.candidate for e in fit.named if e.assumed]
-    at_zero = {(c.joint + 1,) for c in named if c.effect.name == SPRING}
-    springs = {_where(f) for f in findings if f.effect == SPRING and f.joints in at_zero}
-    offsets = {_where(f): f for f in findings if f.effect == OFFSET and _where(f) in springs}
-    rest = [f for f in findings if f.effect != OFFSET or _where(f) not in offsets]
+    at_zero = {(c.joint + 1,) for c in named if c.effect is SPRING}
+    springs = {_where(f) for f in findings if f.effect == SPRING.name and f.joints in at_zero}
+    offsets = {_where(f): f for f in findings if f.effect == OFFSET.name and _where(f) in springs}
+    rest = [f for f in findings if f.effect != OFFSET.name or _where(f) not in offsets]
     return [
-        _resting(f, offsets[_where(f)]) if f.effect == SPRING and _where(f) in offsets else f
+        _resting(f, offsets[_where(f)]) if f.effect == SPRING.name and _where(f) in offsets else f
         for f in rest
     ]
 
@@ -415,7 +416,6 @@ def _idealised(fit: Fit, joint: int) -> float:
 
 
 BINS = 12
-SIGNALS = ("q", "dq", "ddq", "tau")
 
 
 def disagreement(curves: Curves, noise_floor_nm: Array) -> tuple[dict[str, Any], ...]:

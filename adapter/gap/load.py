@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.active import SHOWN_STD
 from adapter.gap.hand import hand_frame
 from adapter.gap.long_recording import Survey, is_long
 from adapter.judgement.posterior import SEGMENTS, Moments, Part, judge, moments_of
@@ -39,7 +40,6 @@ from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log
 
-SHOWN = 3.0  # standard deviations: what is smaller is not there, or not shown
 COM_M, INERTIA_SHARE = 0.05, 0.5  # standard deviations above which a number is not shown
 EDGE, EVERY = 60, 10  # ms at either end, where the filter has no neighbours; between rows
 CLEAR, LEAST_CHANGE_KG = 6.0, 0.05  # standard deviations of a change; what is less is not told
@@ -71,7 +71,7 @@ class HandLoad:
     @property
     def is_there(self) -> bool:
         """Whether it weighs more than the doubt."""
-        return self.mass > SHOWN * self.mass_std
+        return self.mass > SHOWN_STD * self.mass_std
 
     @property
     def com_shown(self) -> bool:

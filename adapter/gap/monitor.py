@@ -18,17 +18,16 @@ import numpy as np
 
 from adapter.effects.by_joint import SMOOTHING_DQ, slowness
 from adapter.effects.catalogue import CATALOGUE
-from adapter.gap.evidence import LEAST_NM
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList, sentence
 from adapter.gap.monitor_signatures import LearnedFrames
+from adapter.judgement.noise import LEAST_NM
 from adapter.learning.change import extremes, is_new
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
 
-VISCOUS = CATALOGUE["viscous_friction"]
 BLOCK_NS = 40_000_000  # states averaged to one row
 TRUST = 4.0  # the learner's information counts one in so many
 STRIBECK_SPEEDS = (0.03, 0.1)  # rad/s; between them, static friction's shape is a sum of theirs
@@ -170,7 +169,8 @@ class Monitor:
             H, rhs = H[np.ix_(rest, rest)], rhs[rest]
         self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
         self._rates = extremes(learner.rates_seen)
-        squares, rubs = self._squares(), [x.band > 0.0 or x is VISCOUS for x in theta.effects]
+        rubs = [x.band > 0.0 or x is CATALOGUE["viscous_friction"] for x in theta.effects]
+        squares = self._squares()
         self._belief.drift[10 * n :] = DRIFT**2 * (np.array(rubs)[:, None] * squares).ravel()
         more = np.sqrt(theta.banded(squares) + LEAST_NM**2)  # static friction above Coulomb's
         self._belief.extend(np.tile(more, len(STRIBECK_SPEEDS)))

@@ -43,7 +43,6 @@ from adapter.screening.timing import TIMING_SHARE
 
 COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
 BRISTLES = CATALOGUE["bristle_friction"]
-EVERYWHERE = (BRISTLES, OFFSET)
 SPRING = CATALOGUE["joint_spring"]
 DRIVEN = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"])
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
@@ -228,7 +227,7 @@ def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = (*DRIVEN
     """With dry friction and offsets of all torques and what joints (from 0) that move have."""
     own = [
         _assumed(fit, effect, j)
-        for effects, where in ((EVERYWHERE, sorted(fit.heard)), (moving, joints))
+        for effects, where in (((BRISTLES, OFFSET), sorted(fit.heard)), (moving, joints))
         for effect in effects
         for j in where
     ]

@@ -32,7 +32,6 @@ from adapter.gap.candidates import (
 )
 from adapter.gap.evidence import (
     BAND_HZ,
-    LEAST_NM,
     Carried,
     Noise,
     Score,
@@ -41,6 +40,7 @@ from adapter.gap.evidence import (
     scores,
 )
 from adapter.gap.fit import Fit
+from adapter.judgement.noise import LEAST_NM
 from adapter.model.spatial import Array
 
 CATALOGUED, PATTERNS, FORMS = "catalogued", "patterns", "forms"

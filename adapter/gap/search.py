@@ -12,7 +12,7 @@ from adapter.effects.base import Effect, TorqueEffect
 from adapter.effects.catalogue import HELD
 from adapter.effects.law import Law
 from adapter.gap.candidates import PATTERN_SHARE, Pattern, is_finer
-from adapter.gap.evidence import LEAST_NM, Carried, Moments, Noise
+from adapter.gap.evidence import Carried, Moments, Noise
 from adapter.gap.fit import (
     Fit,
     Named,
@@ -40,14 +40,16 @@ from adapter.gap.scan import (
     honest_moves,
     least_chi2,
 )
+from adapter.judgement.noise import LEAST_NM
 
 ROUNDS = 24  # some seven are made where every joint has friction of its own
-MOST_SWAPS, SWAP_NATS = 8, 0.0  # names that are exchanged for better ones, and by how much
+MOST_SWAPS = 8  # names that are exchanged for better ones
 LOST = 1.2  # times the residual that a simpler name may leave
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
-FALLS_CHI2 = 4.0  # that friction which falls with the speed must say more to be looked at closely
-RESOLVED_CHI2 = 4.0  # that bristles must be better than friction that slides at once
+# Two standard deviations: that friction which falls with the speed must say more to be looked at
+# closely, and that bristles must be better than friction that slides at once.
+RESOLVED_CHI2 = 4.0
 
 Progress = Callable[[str], None]
 
@@ -131,7 +133,7 @@ def _falling(found: Found) -> Fit:
     """With friction that falls with the speed, on joints where all that is left has a name."""
     fit, patterns = found.fit, {e.candidate.joint for e in found.fit.named if e.is_pattern}
     for own in found.standings:
-        key, asked = (STRIBECK.name, own.candidate.joint), own.chi2 + FALLS_CHI2
+        key, asked = (STRIBECK.name, own.candidate.joint), own.chi2 + RESOLVED_CHI2
         more = any(x.candidate.key == key and x.is_alike and x.chi2 > asked for x in own.rivals)
         if own.candidate.effect is BRISTLES and more and key[1] not in patterns:
             fit = falling(fit, key[1])
@@ -405,7 +407,7 @@ def _swapped(fit: Fit, standings: Sequence[Standing], unnamed: Container[int]) -
             continue
         for rival in own.rivals:
             better, joint = own.gain(rival), own.candidate.joint
-            asked = SWAP_NATS
+            asked = 0.0
             if joint != rival.candidate.joint:
                 joint, asked = -1, FAR_NATS
             elif _is_common(own.candidate.effect) and not _is_common(rival.candidate.effect):

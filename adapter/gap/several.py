@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from adapter.effects.active import SHOWN_STD
 from adapter.effects.catalogue import HELD
 from adapter.gap.evidence import Noise
 from adapter.gap.fit import Fit, place_of
-from adapter.gap.load import SHOWN, HandLoad, load_of
+from adapter.gap.load import HandLoad, load_of
 from adapter.gap.real_arm import fitting_way, with_a_load
 from adapter.gap.result import Finding, GapResult, LogLoad
 from adapter.gap.together import Part, Together
@@ -111,7 +112,7 @@ class Several:
             std[i] = np.sqrt(max(part.free[-10, -10], float(off @ off)))
         off = mass - np.average(mass, weights=std**-2.0)
         there = all(load.is_there for load in self.loads)
-        return there and bool((np.abs(off) < SHOWN * std).all())
+        return there and bool((np.abs(off) < SHOWN_STD * std).all())
 
     def started(self, fit: Fit) -> Fit:
         """A fit on the same recordings with the loads shown; one load where all are the same."""

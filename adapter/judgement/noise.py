@@ -11,6 +11,7 @@ import numpy as np
 
 from adapter.model.spatial import Array
 
+LEAST_NM = 1e-4  # N m; no torque sensor is quieter, and nothing explains a joint better
 MEMORY_S = (0.1, 0.5)  # least and most: the band's 10 Hz, and an arm's misfit
 
 

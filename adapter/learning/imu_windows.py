@@ -18,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.model.spatial import Array
+from adapter.signals.base_motion import LONGEST_PERIODS
 
 STEP_S = 0.005  # of the grid
 KNOT_S = 0.06  # between two knots of the bell, and from one window to the next
 DEGREE = 5  # so smooth that sums over the grid are integrals to 1e-6
 LONGEST_GAP_S = 0.05  # no window spans a longer silence
-LONGEST_PERIODS = 3.0  # nor one of more than so many periods
 PER_KNOT = round(KNOT_S / STEP_S)
 
 

@@ -26,6 +26,9 @@ RANK_TOLERANCE = 1e-10
 # that a URDF has upright to five digits, and no more, show nothing that a sensor could tell.
 LEAST_SHOWN = 1e-4
 
+# From such a share of a parameter's own direction that data show it is known, and learned, alone.
+SHOWN_ALONE = 0.99
+
 # Appends columns to the regressor: (q, dq, ddq), each (m, n), to (m, rows, k).
 ExtraColumns = Callable[[Array, Array, Array], Array]
 

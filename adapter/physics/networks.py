@@ -27,7 +27,6 @@ from adapter.model.inertia import PARAMETERS
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
 
-DTYPE = torch.float64
 PER_BODY = len(PARAMETERS)  # of θ, eq. 4b
 FORCE_Z, MOMENT_Z = 2, 5  # of a wrench [f; m], what a joint that slides or turns takes, eq. 16
 

@@ -13,6 +13,7 @@ import numpy as np
 from adapter.effects.catalogue import KNOWN
 from adapter.gap.workflow import names_of
 from adapter.model.numbers import plus_minus
+from adapter.model.self_model import LEAST_STD
 from adapter.report.html import fill, write_whole
 from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
@@ -25,7 +26,6 @@ HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disag
 FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 MOST_ROWS = 300  # of recordings on the page; of more those to say something of
-LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
 MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording, as figures
 
 

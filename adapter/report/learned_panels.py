@@ -12,6 +12,7 @@ from adapter.effects.base import with_squares
 from adapter.gap.phrases import SHOWN_UNITS
 from adapter.model.inertia import PARAMETERS
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
+from adapter.physics.identifiability import SHOWN_ALONE
 from adapter.report.style import (
     ACCENT,
     GOAL,
@@ -45,7 +46,6 @@ SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time t
 FIRST_S = 0.05  # left end of a logarithmic time axis
 LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
 SETTLED = "inside both goals"
-SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
 SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the panel
 FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
 GROUPS = (("kg", (0,)), ("kg m", (1, 2, 3)), ("kg m²", (4, 7, 9, 5, 6, 8)))  # of ten parameters
@@ -170,7 +170,7 @@ def body_panels(data: RunData) -> list[Panel]:
         drawing = Drawing("quarter", rows=(0.7, 1.0, 1.3), stretch=1.7)
         for ax, (unit, parts) in zip(drawing.axes, GROUPS, strict=True):
             for k in parts:
-                alone = data.theta_shown[j, k] > SHARE_ALONE
+                alone = data.theta_shown[j, k] > SHOWN_ALONE
                 width, alpha = (1.3, 1.0) if alone else (0.7, 0.6)
                 name = named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})")
                 color = joint_color(COLOR_OF[k])

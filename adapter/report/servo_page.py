@@ -22,7 +22,6 @@ from adapter.report.trust import GOOD, LOOK, Check
 from adapter.report.words import arrow, capital
 
 SHARE, CLOSE_MRAD = 0.25, 4.0  # of the error before; or so small: the joint is explained
-TITLES = tuple(title for title, _, _ in EFFECTS.values())  # what the table has, not the headline
 SLOW_RAD_S, MOSTLY = 0.1, 0.5  # where more than that share of what is left is
 
 
@@ -36,7 +35,8 @@ def render_servo_page(
         beside: numbers of this arm and of others of its kind.
     """
     tiles, joints = _tiles(gap), [f"joint {j + 1}" for j in range(len(gap.joint_names))]
-    parts = [x for x in servo_words.headline(gap).split("; ") if not x.startswith(TITLES)]
+    listed = tuple(title for title, _, _ in EFFECTS.values())  # in the table, not the headline
+    parts = [x for x in servo_words.headline(gap).split("; ") if not x.startswith(listed)]
     parts.sort(key=lambda text: not text.startswith("tracking error"))
     panels = []
     for what, factor, unit, (before, after) in (

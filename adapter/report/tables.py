@@ -16,7 +16,8 @@ from adapter.judgement.priors import is_shown
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH
 from adapter.model.tree import Tree
-from adapter.report.learned_panels import SHARE_ALONE, theta_started
+from adapter.physics.identifiability import SHOWN_ALONE
+from adapter.report.learned_panels import theta_started
 from adapter.report.words import REFUSALS, count, number, with_doubt
 from adapter.runs.run_folder import RunData
 
@@ -173,7 +174,7 @@ def theta_matrix(data: RunData) -> Matrix:
 
 
 def _cell(share: float, std: float, unit: str) -> Cell:
-    if share > SHARE_ALONE:
+    if share > SHOWN_ALONE:
         return Cell("alone", f"identifiable, standard deviation {number(std, 2)} {unit}")
     if share > HIDDEN:
         return Cell("mixed", "identifiable only in combination with others")
@@ -232,7 +233,7 @@ def theta_table(data: RunData) -> Table:
     rows = []
     for j, name in enumerate(data.documented.tree.link_names):
         theta, std = data.model.theta[-data.n :][j], data.model.theta_std[-data.n :][j]
-        alone = data.theta_shown[j] > SHARE_ALONE
+        alone = data.theta_shown[j] > SHOWN_ALONE
         pairs = zip(theta, std, alone, strict=True)
         rows.append([name, *(with_doubt(x, s) if a else f"({number(x)})" for x, s, a in pairs)])
     note = (

@@ -16,8 +16,9 @@ from adapter.gap.phrases import numbered
 from adapter.gap.words import finding_parts
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
+from adapter.physics.identifiability import SHOWN_ALONE
 from adapter.report.gap_tables import tied
-from adapter.report.learned_panels import SHARE_ALONE, refusal, theta_started
+from adapter.report.learned_panels import refusal, theta_started
 from adapter.report.words import (
     GOALS,
     NARROW,
@@ -237,7 +238,7 @@ def _parameters(data: RunData) -> Check | None:
         said = "θ was not learned: it waits until λ has settled, and λ had not"
         return Check(BAD, "Inertias and friction", said)
     rank, every = theta.get("base_parameters"), 10 * data.n
-    alone = data.theta_shown > SHARE_ALONE
+    alone = data.theta_shown > SHOWN_ALONE
     said = f"torques show {rank} combinations of {every} inertial parameters, "
     said += f"{int(alone.sum())} of them on their own"
     at, goal = theta.get("converged_s"), f"{TORQUE_GOAL:g} × the error of batch least squares"

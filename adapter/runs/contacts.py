@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.control.observer import Contact, ContactObserver
+from adapter.control.safety import MOVING
 from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -28,7 +29,6 @@ PUSH = np.array([20.0, 20.0, 20.0, 5.0, 5.0, 5.0])  # std of N and N m
 LOAD = np.array([2.0, 0.2, 0.2, 0.2])  # std of kg and kg m
 FRICTION_SHARE = 0.05  # std of a joint's friction, of its effort limit
 CRUDE = 0.2  # of the torques, by which a way may be off: a load's inertia, a push that swells
-SLOW = 0.02  # rad/s; slower, friction has no direction
 
 
 class Kind(StrEnum):
@@ -85,7 +85,7 @@ def _ways(
     ways = [(Kind.PUSH, push), (Kind.LOAD, load)]
     for j in range(n):
         rubs = np.zeros((*q.shape, 1))
-        rubs[:, j, 0] = -size[j] * np.where(np.abs(dq[:, j]) < SLOW, 0.0, np.sign(dq[:, j]))
+        rubs[:, j, 0] = -size[j] * np.where(np.abs(dq[:, j]) < MOVING, 0.0, np.sign(dq[:, j]))
         ways.append((Kind.FRICTION, rubs))
     for j in range(n - 3):  # a push at the hand and one at its last links are alike
         ways.append((Kind.ARM, np.broadcast_to(np.diag(size)[:, : j + 1], (*q.shape, j + 1))))

@@ -18,13 +18,15 @@ from adapter.learning.learner import OnlineLearner, TorqueVerdict
 from adapter.learning.trace import Trace
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.model.spatial import Array
+from adapter.physics.identifiability import SHOWN_ALONE
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import NEWS_BYTES, Snapshot
 from adapter.runs.config import PipelineSettings
-from adapter.runs.outcome import SHOWN_SHARE, Outcome, changes_at, collect, in_parents
+from adapter.runs.outcome import Outcome, changes_at, collect, in_parents
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.terminal import DISAGREEMENT, json_ready, json_text
 from adapter.screening.screen import SHORTEST_S, RecordingRefused, torque_verdict
+from adapter.signals.bristles import LONGEST_S
 from adapter.signals.records import LinkMotionKind, StateLayout, stamp_of, stamps_of
 from adapter.signals.told import Told
 from drivers.files.mcap import Log
@@ -37,7 +39,6 @@ STD_EVERY = 50  # publications; the covariance behind the standard deviations ta
 # as long: joints that stood at first are judged then, and a load that was picked up in the first
 # seconds (its torques may look like another arm's) weighs less.
 FIRST_S, LAST_S = 5.0, 40.0
-HOLE_S = 0.02  # between states of one motion; in a longer one the arm rests
 MOST_ROWS = 20_000  # kept; of more every second one
 
 
@@ -65,7 +66,7 @@ class LiveScreen:
             return self._verdict
         if self._states.due():
             self._states.keep(state[: self._at.tau.stop])
-        self._moved_s += min(1e-9 * (stamp_of(state) - self._last_ns), HOLE_S)
+        self._moved_s += min(1e-9 * (stamp_of(state) - self._last_ns), LONGEST_S)
         self._last_ns = stamp_of(state)
         if self._moved_s >= self._due_s:
             self._due_s *= 2.0
@@ -225,7 +226,7 @@ class Publisher:
         n, schema, theta = learner.tree.n, learner.schema, learner.theta
         tables = schema.covariance(), schema.identifiable
         variance, shown = (np.einsum("jaa->ja", in_parents(schema.R0, x)) for x in tables)
-        lam_std = np.where(shown > SHOWN_SHARE, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        lam_std = np.where(shown > SHOWN_ALONE, np.sqrt(np.maximum(variance, 0.0)), np.nan)
         std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
         bodies = std[: 10 * (n + 1)].reshape(-1, 10)
         rows = np.r_[: n - 1, n] if theta.spare_in_use else np.arange(n)

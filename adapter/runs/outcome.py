@@ -27,11 +27,10 @@ from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfMod
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
-from adapter.physics.identifiability import BaseParameters, random_regressor
+from adapter.physics.identifiability import SHOWN_ALONE, BaseParameters, random_regressor
 from adapter.signals.records import LinkMotionKind
 
 TORQUE_GOAL = 1.1  # times the final batch least squares
-SHOWN_SHARE = 0.99  # of a single direction that must lie in the observable space to be called so
 SAME_LOAD_S = 2.0  # a load that learner and watch date so near each other is one
 
 
@@ -269,7 +268,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         return replace(documented, provenance={**provenance, **said})
     documented, bodies = with_bodies(documented), documented.tree.bodies
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
-    shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
+    shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_ALONE
     lam, filled = completed_lambda(outcome, documented)
     known = outcome.theta_started_ns is not None
     told = told_parameters(outcome, documented)
@@ -291,7 +290,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
         theta_std=theta_std,
-        theta_identifiable=share > SHOWN_SHARE,
+        theta_identifiable=share > SHOWN_ALONE,
         posterior=posterior,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adapter.effects.active import with_bodies
+from adapter.effects.active import SHOWN_STD, with_bodies
 from adapter.effects.by_joint import WAYS_RAD, JointSignals
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
-from adapter.gap.load import SHOWN
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
@@ -244,7 +243,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
             for k, effect in enumerate(effects_by_name(outcome.settings.effects))
         },
         "changes": changes_at(outcome.changes_ns, outcome.payload, outcome.disagreements),
-        "held": held if held["m"] > SHOWN * held["m_std"] else None,
+        "held": held if held["m"] > SHOWN_STD * held["m_std"] else None,
         "rebuilds": outcome.rebuilds,
         "started_s": None,
         "values": outcome.theta.tolist(),

@@ -20,7 +20,7 @@ from adapter.physics.kernels import jit
 
 PLACE_S = 0.05  # that the place takes to follow q: noise of both readings about evenly
 BACK_RAD = 3.5e-4  # eight standard deviations of a place with a real Panda's noise
-LONGEST_S = 0.02  # between two samples whose velocity tells the way
+LONGEST_S = 0.02  # between two samples of one motion, whose velocity tells the way
 
 
 class Bristles(NamedTuple):

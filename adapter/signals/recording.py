@@ -15,7 +15,7 @@ from drivers.interface import Array, DriverError
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
 _LISTED = 10  # gaps and topics that are listed one by one
 _SLIDING = {"q_rad": "m", "dq_rad_s": "m/s", "tau_nm": "N"}
-_FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
+_FAST, RESTING = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
@@ -196,7 +196,7 @@ def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array, slides: Seque
 def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
     log = looked.parts[0]
     with np.errstate(invalid="ignore"):
-        moving = np.abs(dq) > _REST
+        moving = np.abs(dq) > RESTING
     resting = [n for j, n in enumerate(log.joint_names) if not moving[:, j].any()]
     seconds = float(moving.any(axis=1).mean()) * _duration_s(looked)
     said = [f"{seconds:.3g} s of motion"]

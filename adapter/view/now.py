@@ -16,7 +16,7 @@ from adapter.effects.active import with_bodies
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
-from adapter.physics.identifiability import base_parameters, frame_observability
+from adapter.physics.identifiability import SHOWN_ALONE, base_parameters, frame_observability
 from adapter.realtime.run_messages import nearest_frames
 from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot
@@ -27,7 +27,6 @@ ROWS_A_LOOK = 8  # states of which the residual is computed, spread over those s
 RMS_S, LATELY_S = 1.0, 5.0  # of residuals; of timing
 FRAMES_EVERY = 1000  # states; they take milliseconds
 ABOVE_NOISE = 2.0  # times the noise, beyond which a residual is said to be more
-SHOWN_ALONE = 0.99  # of a parameter's direction, that lies in what torques show
 BEHIND = 1000  # samples that wait for the learner, beyond which it is said
 WAITING, LEARNING, CONVERGED = "waiting", "learning", "converged"
 

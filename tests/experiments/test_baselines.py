@@ -41,7 +41,7 @@ from adapter.experiments.baselines.paper import (
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
-from adapter.physics.networks import DTYPE, FrameMotion, inverse_dynamics, theta_from_log_cholesky
+from adapter.physics.networks import FrameMotion, inverse_dynamics, theta_from_log_cholesky
 from tests.helpers.arm_data import free_answers, pin_tree
 from tests.helpers.robot_models import relative
 
@@ -110,7 +110,7 @@ def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
         """Columns are wrench and torques of unit accelerations from rest."""
         still, columns = torch.zeros_like(q), []
         zero = q.new_zeros((len(q), 3))
-        for unit in torch.eye(6 + TREE.n, dtype=DTYPE):
+        for unit in torch.eye(6 + TREE.n, dtype=torch.float64):
             a, dw, ddq = (x.expand(len(q), -1) for x in unit.split([3, 3, TREE.n]))
             base = FrameMotion(zero, zero, a, dw)
             columns.append(inverse_dynamics(TREE, lam, theta, (q, still, ddq), base))
@@ -126,9 +126,9 @@ def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
 def test_mass_matrix_of_the_network_is_positive_definite_and_learns() -> None:
     """Symmetric, and the torque's gradient by the weights is that by differences."""
     torch.manual_seed(0)
-    net = MassNetwork(torch.rand(8, 8, dtype=DTYPE) + 0.5, (5, 4), seed=0).double()
-    q, dq, ddq = (torch.randn(3, 2, dtype=DTYPE) for _ in range(3))
-    base = FrameMotion(*(torch.randn(3, 3, dtype=DTYPE) for _ in range(4)))
+    net = MassNetwork(torch.rand(8, 8, dtype=torch.float64) + 0.5, (5, 4), seed=0).double()
+    q, dq, ddq = (torch.randn(3, 2, dtype=torch.float64) for _ in range(3))
+    base = FrameMotion(*(torch.randn(3, 3, dtype=torch.float64) for _ in range(4)))
     m = net(10.0 * q)
     assert torch.equal(m, m.mT) and torch.linalg.eigvalsh(m).min() > 0.0
 

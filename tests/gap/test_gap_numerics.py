@@ -21,7 +21,7 @@ from adapter.effects.bodies import theta_of
 from adapter.effects.by_joint import AT_REST
 from adapter.effects.torque import sensed_torque
 from adapter.gap.candidates import Candidate, log_odds, patterns, signatures, stages_of
-from adapter.gap.evidence import LEAST_NM, Carried, noise_of, score
+from adapter.gap.evidence import Carried, noise_of, score
 from adapter.gap.findings import parameter_std
 from adapter.gap.fit import (
     Fit,
@@ -40,6 +40,7 @@ from adapter.gap.held_out import possible
 from adapter.gap.rivals import Rival, Standing, standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
+from adapter.judgement.noise import LEAST_NM
 from adapter.judgement.priors import theta_prior
 from adapter.model.inertia import is_consistent
 from adapter.model.robots import documented

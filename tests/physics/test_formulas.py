@@ -11,7 +11,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.tree import Tree
 from adapter.physics import kernels, networks
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of
-from adapter.physics.networks import DTYPE, FrameMotion
+from adapter.physics.networks import FrameMotion
 from adapter.physics.rigid_arm import RigidArm
 from tests.helpers.arm_data import PIN_ORDER
 from tests.helpers.robot_models import (
@@ -68,10 +68,10 @@ def test_gradients_of_the_networks(floating: bool) -> None:
     """gradcheck over λ, θ, joint signals and the base's motion."""
     torch.manual_seed(0)
     tree = Tree((-1, 0, 0, -1), floating, slides=(False, True, False, True))
-    signals = [torch.randn(2, tree.n, dtype=DTYPE, requires_grad=True) for _ in range(3)]
-    lam = torch.randn(tree.n, 6, dtype=DTYPE, requires_grad=True)
-    theta = torch.randn(tree.bodies, 10, dtype=DTYPE, requires_grad=True)
-    base = [torch.randn(2, 3, dtype=DTYPE, requires_grad=True) for _ in range(4)]
+    signals = [torch.randn(2, tree.n, dtype=torch.float64, requires_grad=True) for _ in range(3)]
+    lam = torch.randn(tree.n, 6, dtype=torch.float64, requires_grad=True)
+    theta = torch.randn(tree.bodies, 10, dtype=torch.float64, requires_grad=True)
+    base = [torch.randn(2, 3, dtype=torch.float64, requires_grad=True) for _ in range(4)]
 
     def motion(lam, q, dq, ddq, *base):  # type: ignore[no-untyped-def]
         return tuple(networks.link_motion(tree, lam, (q, dq, ddq), FrameMotion(*base)))
@@ -226,9 +226,9 @@ def test_torque_of_a_wrench_is_pinocchios_jacobian(robot: str) -> None:
 def test_at_rest_an_accelerometer_reads_the_reaction_to_gravity() -> None:
     """a_0 = -g on a base at rest, whatever way the base is mounted; and the base carries all."""
     wall = np.array([9.81, 0.0, 0.0])
-    still = torch.zeros(1, 1, dtype=DTYPE)
+    still = torch.zeros(1, 1, dtype=torch.float64)
     motion = networks.link_motion(
-        Tree((-1,)), torch.zeros(1, 6, dtype=DTYPE), (still,) * 3, torch.from_numpy(wall)
+        Tree((-1,)), torch.zeros(1, 6, dtype=torch.float64), (still,) * 3, torch.from_numpy(wall)
     )
     assert motion.a[0, 0].tolist() == [-9.81, 0.0, 0.0]
     assert base_at_rest(wall).tolist() == [0.0] * 6 + [-9.81] + [0.0] * 5

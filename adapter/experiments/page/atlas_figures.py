@@ -55,7 +55,6 @@ SMALLEST = 1e-16  # of an error in double precision; an exact zero is drawn here
 PERCENT = 100.0
 KINEMATIC_GOAL = 1e-6  # of |k - k_hat| in SI units; ours, the paper states none
 SET_NAMES = {"train": "muted", "test": "accent", "control": "goal"}  # the page's colours
-SET_COLORS = {name: STAND_IN[color] for name, color in SET_NAMES.items()}
 MOST_JOINTS = 16  # in one panel of boxes
 LARGEST = 2.0  # of eq. 20: torques of opposite sign
 ROOM = 1.2  # times, between what is shown and the end of a logarithmic axis
@@ -327,7 +326,7 @@ def side_by_side(atlas: AtlasResults) -> Panel | None:
         for side, name in zip((-0.2, 0.0, 0.2), SETS, strict=True):
             errors = np.array([learner.median[name], learner.p99[name]])
             middle, high = PERCENT * np.maximum(errors, SMALLEST)
-            color = SET_COLORS[name]
+            color = STAND_IN[SET_NAMES[name]]
             ax.plot([k + side] * 2, [middle, high], color=color, linewidth=2.0, alpha=0.45)
             ax.plot([k + side], [middle], "o", color=color, markersize=4.5)
             ax.plot([k + side], [high], "_", color=color, markersize=7)
@@ -360,7 +359,7 @@ def _boxes(
     for k, name in enumerate(SETS):
         whisker, first, middle, third, end = PERCENT * np.maximum(rows[name], SMALLEST).T
         x = np.arange(len(joints)) + (k - 1.0) * width
-        color = SET_COLORS[name]
+        color = STAND_IN[SET_NAMES[name]]
         ax.vlines(x, whisker, end, color=color, linewidth=0.9)
         ax.bar(x, third - first, 0.82 * width, first, color=color, alpha=0.4, linewidth=0, zorder=2)
         ax.hlines(middle, x - 0.41 * width, x + 0.41 * width, color=color, linewidth=1.6, zorder=3)

@@ -23,11 +23,11 @@ from adapter.model.inertia import (
     theta_from_pseudo_inertia,
 )
 from adapter.model.spatial import Array
+from adapter.physics.identifiability import SHOWN_ALONE
 
 KEPT = 0.05  # of a documented body that is left of it at least, where what was learned allows it
 LEAST_SIZE = 1e-3  # share of a measuring body, and kg, that a documented one has at least
 NEARNESS = 1e-8  # weight of nearness beside the torques, where both cannot be had
-ALONE = 0.99  # of a parameter that must show for it to be called learned
 UNSOLVED = "no possible bodies were found near what was learned; is it sound?"
 
 
@@ -116,7 +116,7 @@ def filled_words(basis: Array, names: tuple[str, ...]) -> list[str]:
     Args:
         basis: as of `filled_theta`; names: of the bodies.
     """
-    shown = np.einsum("ab,ab->a", basis, basis).reshape(-1, len(PARAMETERS)) > ALONE
+    shown = np.einsum("ab,ab->a", basis, basis).reshape(-1, len(PARAMETERS)) > SHOWN_ALONE
     found = []
     for name, flags in zip(names, shown, strict=True):
         own = [p for p, flag in zip(PARAMETERS, flags, strict=True) if flag]

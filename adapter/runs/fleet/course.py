@@ -25,7 +25,6 @@ from adapter.model.spatial import Array
 
 FEWEST = 5  # numbers that a line, or what stands out beside others, takes
 CHANCE = 0.01  # of one false alarm among all that is asked of an arm
-TOLD_APART = 0.01  # that one column matters beside another one, by chance
 FARTHEST = 3.0  # standard deviations that a scatter counts for away from the usual one
 MOST_FREEDOM = 16.0  # what all say of one, as so many numbers of its own; more, and a tail counts
 TINY = 1e-300
@@ -147,7 +146,7 @@ def _told_apart(
             fit = _fit(one, [columns[drift.follows], columns[other.follows]], use)
             matter = [False, False]
             if fit is not None:
-                matter = [x < TOLD_APART for x in Usual.of([fit]).chances(fit)[1:]]
+                matter = [x < CHANCE for x in Usual.of([fit]).chances(fit)[1:]]
             if not any(matter):
                 rivals.append(other.follows)
             if not matter[1]:
