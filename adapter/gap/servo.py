@@ -48,6 +48,7 @@ from adapter.gap.servo_kernels import (
 from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_result import DOCUMENTED_SHARE, SURE, Findings, ServoGap, rms
 from adapter.gap.servo_signals import Track, loads, over_ground
+from adapter.gap.torque_gains import LEARNED_SHARE
 from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -61,7 +62,6 @@ ROUNDS = 2  # in which the load follows from the arm's simulated motion
 LEAST_DELAY_S = 1e-5  # standard deviation of one joint's, at least
 DOCUMENTED_DELAY_S = 5e-5  # the same of a delay
 TIE_CHI2 = 4.0  # by which an effect must foretell blocks that its fit has not seen better
-FITTED_SHARE = 2.0 / 3.0  # of a recording, where none is held out
 DRAWS = 8  # of inertias as wrong as the documentation may be
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
@@ -490,12 +490,12 @@ def _scored(
         tracks, told, fitted = arm.tracks, "last third, servos fitted before it", []
         for fit in fits:
             pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
-            rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
+            rows = [take & (t.stamp_s < LEARNED_SHARE * t.stamp_s[-1]) for t, take in pairs]
             fitted.append(fit_joint(replace(fit.task, rows=rows), fit.freedom, fit.x))
         servos = _servos(arm, fitted) if fitted else servos
     found = []
     for t in tracks:
-        take = t.judged if unseen else t.stamp_s >= FITTED_SHARE * t.stamp_s[-1]
+        take = t.judged if unseen else t.stamp_s >= LEARNED_SHARE * t.stamp_s[-1]
         ways = (t.q - t.left(s.follow(t, arm.rigid)) for s in (arm.documented, servos))
         found.append((t.name, RolloutCurves(*(x[take] for x in (t.stamp_s, t.q, *ways)))))
     return tuple(found), told
