@@ -31,8 +31,9 @@ def headline(gap: ServoGap) -> str:
 
 
 def _height(gap: ServoGap) -> str:
-    height = 1e3 * gap.ground.height
-    return f"{plain(abs(height), 2)} mm {'above' if height > 0.0 else 'below'} the base's origin"
+    height = round(100.0 * gap.ground.height)  # cm: what moves it between starts of the search
+    side = "above" if height > 0 else "below"
+    return f"about {abs(height)} cm {side} the base's origin" if height else "as high as the base"
 
 
 def grounded(gap: ServoGap) -> str:

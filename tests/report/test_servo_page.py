@@ -62,7 +62,7 @@ def test_the_page_says_what_was_found_and_what_to_do() -> None:
     said = text_of(page)
     for part in (
         "at the hand 11 mm → 2.0 mm (2 recordings held out).",
-        "The hand came down on something 20 mm below",
+        "The hand came down on something about 2 cm below",
         "commands act 3.00 ms late",
         "12.00 ± 0.20, not 14.0",
         "joint 3: not better",
