@@ -129,11 +129,13 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 def _check_export(args: argparse.Namespace) -> None:
     if args.lerobot is not None:
         others = args.urdf, args.mjcf, args.onto, args.alone, args.servo, args.ranges, args.c
-        if any(others):
+        if any((*others, args.samples)):
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
     if args.samples is not None and (args.servo is not None or args.samples < 1):
         raise UsageError("--samples N (1 or more) are drawn from a learned model, not of --servo")
+    if args.samples is not None and args.urdf is None and args.mjcf is None:
+        raise UsageError("--samples need a folder: --urdf FOLDER, --mjcf FOLDER")
     if args.servo is not None:
         options.check_robot(str(args.model))
     elif args.model.suffix != ".json":
@@ -145,8 +147,6 @@ def _check_export(args: argparse.Namespace) -> None:
     elif args.onto.suffix not in (".urdf", ".xml"):
         raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
     elif args.urdf is None and args.mjcf is None:
-        if args.samples is not None:
-            raise UsageError("--samples need a folder: --urdf FOLDER, --mjcf FOLDER")
         path = args.onto.with_suffix(f".learned{args.onto.suffix}")
         args.urdf, args.mjcf = (path, None) if path.suffix == ".urdf" else (None, path)
     elif (args.urdf if args.onto.suffix == ".urdf" else args.mjcf) is None:

@@ -209,19 +209,20 @@ def run_export(args: argparse.Namespace) -> int:
         facts[key] = list(model.provenance.get(key, ()))
     paths = args.urdf, args.mjcf, args.c
     writers.append(lambda model, **_: c_text(model))
+    drawn = [] if args.samples is None else with_bodies(model).sample(args.samples, args.seed)
     for kind, path, text_of in zip(SUFFIXES, paths, writers, strict=True):
         if path is None:
             continue
         fits = args.onto is not None and args.onto.suffix == SUFFIXES[kind]
         write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
         written = write(model)
-        if args.samples is None:
+        if args.samples is None or kind == "c":
             write_robot(path, written)
         else:
             path.mkdir(parents=True, exist_ok=True)
-            for number, drawn in enumerate(with_bodies(model).sample(args.samples, args.seed)):
+            for number, own in enumerate(drawn):
                 file = path / f"{number:04d}{SUFFIXES[kind]}"
-                file.write_bytes(write(drawn).text.encode())
+                file.write_bytes(write(own).text.encode())
             warn(shortcomings(path, written))
         facts[kind] = str(path)
         facts["onto"] = facts.get("onto") or written.onto

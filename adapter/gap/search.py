@@ -47,9 +47,9 @@ MOST_SWAPS = 8  # names that are exchanged for better ones
 LOST = 1.2  # times the residual that a simpler name may leave
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
-# Two standard deviations: that friction which falls with the speed must say more to be looked at
-# closely, and that bristles must be better than friction that slides at once.
-RESOLVED_CHI2 = 4.0
+# That friction which falls with the speed must say more to be looked at closely, and that bristles
+# must be better than friction that slides at once.
+TWO_SIGMA_CHI2 = 4.0
 
 Progress = Callable[[str], None]
 
@@ -133,7 +133,7 @@ def _falling(found: Found) -> Fit:
     """With friction that falls with the speed, on joints where all that is left has a name."""
     fit, patterns = found.fit, {e.candidate.joint for e in found.fit.named if e.is_pattern}
     for own in found.standings:
-        key, asked = (STRIBECK.name, own.candidate.joint), own.chi2 + RESOLVED_CHI2
+        key, asked = (STRIBECK.name, own.candidate.joint), own.chi2 + TWO_SIGMA_CHI2
         more = any(x.candidate.key == key and x.is_alike and x.chi2 > asked for x in own.rivals)
         if own.candidate.effect is BRISTLES and more and key[1] not in patterns:
             fit = falling(fit, key[1])
@@ -312,7 +312,7 @@ def _as_resolved(found: Found) -> Found:
     for k, e in enumerate(fit.named):
         if e.candidate.effect is not BRISTLES or k in found.weak:
             continue
-        if lost_at_once(fit, carried, k) + 2.0 * BRISTLES.log_odds_of(e.values) < RESOLVED_CHI2:
+        if lost_at_once(fit, carried, k) + 2.0 * BRISTLES.log_odds_of(e.values) < TWO_SIGMA_CHI2:
             told = replace(e.candidate, effect=COULOMB)
             rivals = tuple(r for r in standings[k].rivals if r.candidate.key != told.key)
             standings[k] = replace(standings[k], candidate=told, rivals=rivals)

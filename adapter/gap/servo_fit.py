@@ -109,7 +109,7 @@ class Freedom:
         x[WITHIN] = x[LEAD] if x[LEAD] > 0.0 else x[WITHIN] * x[DAMPING]
         return x
 
-    def beside(self, k: int, within: float | None = None) -> Freedom:
+    def beside(self, k: int, within: float | None) -> Freedom:
         """With one parameter more, and another share of the damping within the torque's limit."""
         free, documented = self.free.copy(), self.documented.copy()
         free[k] = True

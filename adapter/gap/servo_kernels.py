@@ -247,7 +247,7 @@ def follow_alone(x, goal, load, start, step, q):
             at += 0.5 * share * step * (speed + (after if share == 1.0 else 0.0))
             speed = after if share == 1.0 else 0.0
             left = (1.0 - share) * step
-        force, rubs = steers - holds * at, x[RUBS] + x[STICKS]
+        force, rubs = steers - holds * at, dry_friction(x, 0.0)
         if left > 0.0 and abs(force) > rubs:
             force -= rubs if force > 0.0 else -rubs
             middle = force / (2.0 * mass / left + 0.5 * left * holds + damping)

@@ -14,7 +14,7 @@ from drivers.interface import Array, DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
 _LISTED = 10  # gaps and topics that are listed one by one
-_SLIDING = {"q_rad": "m", "dq_rad_s": "m/s", "tau_nm": "N"}
+_SLIDING_UNIT = {"q_rad": "m", "dq_rad_s": "m/s", "tau_nm": "N"}
 _FAST, RESTING = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
@@ -156,7 +156,7 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
         f"{facts['backward_steps']} steps back in time; {facts['not_finite']} not a number",
         *(
             f"{name}: {'  '.join(map('{:.3g}..{:.3g}'.format, found['min'], found['max']))}"
-            + _sliding(facts, _SLIDING[name])
+            + _sliding(facts, _SLIDING_UNIT[name])
             for name, found in facts["range"].items()
         ),
         *([f"command less position, rms: {'  '.join(off)} {unit}"] if off else []),

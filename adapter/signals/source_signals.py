@@ -16,7 +16,7 @@ from drivers.errors import choices
 from drivers.files.mcap import Commands
 from drivers.interface import Array, DriverError
 
-SLIDING = "m", "mm", "N"  # units of joints that do
+SLIDING_UNITS = "m", "mm", "N"  # units of joints that do
 _PLACES = {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3}
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -316,7 +316,7 @@ class SourceReader:
             unit = known.get(word.casefold(), "")
             if unit in UNITS[signal]:
                 factors[k] = UNITS[signal][unit]
-                if unit not in SLIDING:  # those say nothing of the other columns
+                if unit not in SLIDING_UNITS:  # those say nothing of the other columns
                     self.units.setdefault(signal, unit)
             elif word:
                 usual = next(iter(UNITS[signal]))

@@ -30,6 +30,7 @@ _HEAD = """#include <math.h>
 #include <string.h>
 #define N 7
 """
+COMPILER = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
 OPTIONS = ("-O2", "-shared", "-fPIC", "-x", "c", "-", "-lm")
 TIMEOUT_S = 60.0
 
@@ -71,14 +72,13 @@ def model_library(truth: Truth) -> bytes | None:
 
 @cache
 def _built(source: str) -> bytes | None:
-    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
-    if compiler is None or (platform.system(), platform.machine()) != ("Linux", "x86_64"):
+    if COMPILER is None or (platform.system(), platform.machine()) != ("Linux", "x86_64"):
         return None
     with tempfile.TemporaryDirectory() as work:
         built = Path(work) / "model.so"
         try:
             subprocess.run(
-                [compiler, *OPTIONS, "-o", str(built)],
+                [COMPILER, *OPTIONS, "-o", str(built)],
                 input=source.encode(),
                 capture_output=True,
                 timeout=TIMEOUT_S,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,10 +22,10 @@ from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
+from sim.fci.model import COMPILER
 from tests.helpers.robot_models import machine_urdf, read_quietly
 from tests.simulate.test_rollouts import BALL, CASES, SENSED
 
-COMPILER = next((x for x in ("cc", "gcc", "clang") if shutil.which(x)), None)
 compiled = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc, gcc, clang) is here")
 LAWS = (
     ("law: dq |dq|", 3, {"c": 0.2}),
