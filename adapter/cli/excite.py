@@ -28,6 +28,7 @@ from adapter.effects.phrases import DecidingExperiment
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.report.next_steps import Step, command
 from adapter.report.plan_page import Plan
 from adapter.runs.config import read_config
 from adapter.runs.library import filtered
@@ -250,7 +251,6 @@ def _write(
     names = arm.model.tree.joint_names
     plan = Plan(arm, motion, limits, arm.clearance(motion, seconds))
     lines = plan.lines(seconds)
-    page = plan.write(folder / PLAN_PAGE, lines)
     step_ns = round(1e9 / args.rate)
     rows = [np.array([motion.q, motion.dq, motion.ddq])]
     while not motion.at_rest:
@@ -271,4 +271,7 @@ def _write(
     for line in lines:
         show(line)
     show(f"{len(points)} points at {args.rate:g} Hz: {folder / 'motion.csv'}, motion.mcap")
-    say(f"As a page: {page}")
+    robot = [] if args.robot is None else ["--robot", args.robot]
+    step = Step("Play it", command("run", "--motion", folder / "motion.csv", *robot))
+    show(f"next: {step.why}: {step.command}")
+    say(f"As a page: {plan.write(folder / PLAN_PAGE, lines, [step])}")

@@ -42,7 +42,7 @@ COMMANDS = {  # in the order of --help
         run_options.declare,
         "learn live",
         may_end=tuple(ExitCode),
-        begins="learning live from {driver}, {duration:g} s",
+        begins="learning live from {driver}",
     ),
     "plan": Command(
         run_options.declare_plan,

@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     asked = run_plan(args)
     robot, limits = asked.robot, MotionLimits.of(asked.robot)
-    draw = asked.free_motion(args.duration)
+    draw = asked.free_motion()
     driver = asked.open(args.driver, False)
     driver.connect()
     try:
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     assert draw.least is not None
     bound = push_bound(robot, motion, limits, asked.config.safety)
     plan = Plan(draw.arm, motion, limits, draw.least)
-    lines = plan.lines(args.duration + asked.config.excitation.slow_s, bound.lines())
+    lines = plan.lines(asked.duration_s + asked.config.excitation.slow_s, bound.lines())
     # the run of this plan: the same words, but where the plan goes
     kept = without(sys.argv[2:], ["--out"])
     kept += ["--allow-motion"] if asked.maybe_real and "--allow-motion" not in kept else []

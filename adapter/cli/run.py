@@ -27,18 +27,17 @@ from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.designed import Designer
 from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward, ModelFeedforward, not_learned
-from adapter.control.free_path import ArmInCell, FreeMotion
+from adapter.control.free_path import ArmInCell, Draw, FreeMotion
 from adapter.control.information import Information
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.observer import ContactObserver
-from adapter.control.path_motion import PathMotion
+from adapter.control.played import Player
 from adapter.control.resting import CarriedWeight
-from adapter.control.settings import DESIGNED, ExcitationSettings, gentle
+from adapter.control.settings import DESIGNED, gentle
 from adapter.effects.active import with_bodies
 from adapter.errors import UsageError
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array
 from adapter.realtime.following import FeedforwardBound, FollowingObserver, LearnedFeedforward
 from adapter.realtime.jobs import Jobs, RecordingJob
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
@@ -53,6 +52,7 @@ from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.matching import counted, present
+from adapter.signals.motion_file import read_motion
 from adapter.view.foxglove_view import free_port, need_foxglove
 from adapter.view.now import KnownRun
 from adapter.view.page import PERIOD_S, make_view
@@ -62,7 +62,7 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import joint_count, maybe_real, open_driver, split_address
 
-DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
+USUAL_S = 30.0
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
 AS_TOLD = ("set_aside", "skipped", "restarts", "recorded", "unrecorded", "tracking")  # by the loop
 
@@ -89,6 +89,8 @@ class RunPlan:
         maybe_real: the arm may be a real one.
         feedforward: model that helps the controller; where nobody says, the documented one helps a
             designed motion, which feedback alone would follow with too large an error.
+        duration_s: of the motion, without the slow start of an arm that may be real.
+        played: the motion of a file; None for one that is drawn here.
     """
 
     robot: SelfModel
@@ -96,22 +98,28 @@ class RunPlan:
     world: SimulationLike | None
     maybe_real: bool
     feedforward: str
+    duration_s: float
+    played: Player | None
 
-    def free_motion(self, duration_s: float) -> FreeMotion:
+    def draw(self, arm: ArmInCell | None = None) -> Draw:
+        """What draws a motion, one that keeps an arm's links clear where one is told."""
+        if self.played is not None:
+            return self.played
+        if self.config.excitation.kind != DESIGNED:
+            return RandomMotion
+        designer = Designer(Information(self.robot, self.config.pipeline.filter))
+        return designer if arm is None else designer.within(arm)
+
+    def free_motion(self) -> FreeMotion:
         """What draws a motion that is free in the cell. Raises SettingsError, MeansError."""
-        arm, motion = ArmInCell(self.robot, self.config.cell), self.config.excitation
-        draw = self.designer().within(arm) if motion.kind == DESIGNED else RandomMotion
-        return FreeMotion(arm, duration_s + motion.slow_s, draw)
+        arm = ArmInCell(self.robot, self.config.cell)
+        return FreeMotion(arm, self.duration_s + self.config.excitation.slow_s, self.draw(arm))
 
     def open(self, address: str, may_move: bool) -> Driver:
         """The driver of an address, not connected yet. Raises UsageError, ValueError."""
         scheme, _ = split_address(address)
         builders = {} if self.world is None else {scheme: self.world.driver}
         return open_driver(address, builders, self.robot.tree.joint_names, may_move)
-
-    def designer(self) -> Designer:
-        """What designs a motion, wherever it goes."""
-        return Designer(Information(self.robot, self.config.pipeline.filter))
 
 
 def run_plan(args: argparse.Namespace) -> RunPlan:
@@ -142,9 +150,13 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     if real and _may_move(args):
         need_complete(robot)
         config = dataclasses.replace(config, excitation=gentle(config.excitation))
-    usual = "documented" if config.excitation.kind == DESIGNED else "none"
-    forward = args.feedforward or usual
-    return RunPlan(config.apply(robot), config, world, real, forward)
+    motion, limits, played, duration_s = config.excitation, MotionLimits.of(robot), None, USUAL_S
+    if args.motion is not None:
+        played = Player(args.motion.name, *read_motion(args.motion, robot.tree.joint_names))
+        duration_s = played.seconds(limits, motion)
+    usual = "documented" if played is not None or motion.kind == DESIGNED else "none"
+    forward, duration_s = args.feedforward or usual, args.duration or duration_s
+    return RunPlan(config.apply(robot), config, world, real, forward, duration_s, played)
 
 
 def _may_move(args: argparse.Namespace) -> bool:
@@ -222,9 +234,9 @@ def controller_of(
         forward = LearnedFeedforward(robot.tree, gravity, effects, tool, known, bound)
     control = ControlSettings(safety=config.safety)
     limits = MotionLimits.of(robot)
-    draw: DrawMotion = plan.designer() if plan.config.excitation.kind == DESIGNED else RandomMotion
+    draw: Callable[..., Any] = plan.draw()
     if plan.maybe_real:
-        draw = free = plan.free_motion(args.duration)
+        draw = free = plan.free_motion()
         free.arm.meanwhile = reading(driver)
     controller = ExcitationController(limits, config.excitation, control, forward, draw, expected)
     if plan.maybe_real and not (args.trust_model and driver.adds_gravity):
@@ -243,7 +255,7 @@ def _go(
     """The live run itself; an arm that may be real shows its plan and has a dead man's switch."""
     config, robot, maybe_real = plan.config, plan.robot, plan.maybe_real
     controller = controller_of(args, plan, driver)
-    duration_s = args.duration + (config.excitation.slow_s if controller is not None else 0.0)
+    duration_s = plan.duration_s + (config.excitation.slow_s if controller is not None else 0.0)
     recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
     effects = config.pipeline.learner.effects
     known = KnownRun(robot, effects, args.driver, duration_s, secrets.token_hex(8))

@@ -28,8 +28,10 @@ RUN_WORDS = {
     "--trust-model": "move an arm that may be real although what it holds at rest is not the "
     "weight that the model says",
     "--excitation": "motion: random (default), or designed to teach most in the time",
-    "--duration": "default 30; where the arm moves slowly at first (excitation.slow_s), behind "
-    "that",
+    "--motion": "play this motion instead: a table of times and positions, or an MCAP with a "
+    "JointTrajectory, as `adapter excite` writes both; slowed down where limits ask for it",
+    "--duration": "default 30, or as long as --motion takes; where the arm moves slowly at first "
+    "(excitation.slow_s), behind that",
     "--scenario": "of the simulated arm: nominal, as_built (as real ones differ), bent_link, "
     "payload_at_20s, friction, real_drives, wall_mounted (whose mounting is to be told: "
     "--gravity 9.81 0 0)",
@@ -56,8 +58,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--yes", action="store_true", help="move without being asked after the plan")
     add("--trust-model", action="store_true")
     add("--excitation", choices=KINDS)
+    add("--motion", type=Path, metavar="FILE")
     options.add_motion(parser)
-    add("--duration", type=float, default=30.0, metavar="S")
+    add("--duration", type=float, metavar="S")
     add("--scenario", metavar="NAME")
     add("--set", action="append", default=[], metavar="KEY=VALUE")
     add("--passive", action="store_true", help="only listen; do not move the arm")
@@ -93,7 +96,11 @@ def _port(text: str) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    if not args.duration > 0.0:
+    if args.motion is not None:
+        options.check_files(args.motion)
+        if args.excitation or args.range:
+            raise UsageError("--motion says how the arm moves; leave --excitation and --range out")
+    if args.duration is not None and not args.duration > 0.0:
         raise UsageError(f"--duration must be above zero, got {args.duration}")
     scheme, rest = split_address(args.driver)
     if is_own(scheme):

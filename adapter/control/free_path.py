@@ -381,5 +381,5 @@ class FreeMotion:
                 return motion
         raise SettingsError(
             f"no free motion was found from here; the nearest of the last one: {nearest}, where "
-            f"{margin:g} m are kept. Move the arm to where it has more room"
+            f"{margin:g} m are kept. Move the arm to where it has more room, or take another motion"
         )

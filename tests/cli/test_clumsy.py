@@ -15,7 +15,7 @@ from drivers.errors import choices
 RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 FILES = {  # the words after a command, FILE being what cannot be used
     "run": ["--driver", "log:FILE", "--duration", "1"],
-    "plan": ["--robot", "FILE"],
+    "plan": ["--motion", "FILE"],
     "excite": ["FILE"],
     "replay": ["FILE"],
     "gap": ["FILE", "--robot", "panda"],
