@@ -16,7 +16,6 @@ from rich.console import Console
 from rich.table import Table
 
 from adapter.discovery import Discovery, discover
-from adapter.model.self_model import SelfModel
 from tests.helpers.benchmark import options, write
 from tests.helpers.discovery_data import TRUSTED, Case, Motion, anyhow, record
 from tests.helpers.discovery_data import robot as model_of
@@ -44,18 +43,19 @@ class Kind:
     mounted: float = 0.0
     named: bool = False
 
-    def case(self, model: SelfModel, seed: int) -> Case:
+    def case(self, name: str, seed: int) -> Case:
         """The recording of a seed."""
-        drawn = np.random.default_rng([seed, 23]).permutation(model.tree.n).tolist()
+        n = model_of(name).tree.n
+        drawn = np.random.default_rng([seed, 23]).permutation(n).tolist()
         still = tuple(drawn[: self.resting])
         rest = drawn[self.resting :]
         pairs = tuple((rest[2 * k], rest[2 * k + 1]) for k in range(self.alike))
         motion = Motion(self.seconds, 1000.0, still, pairs)
-        loose = np.random.default_rng([seed, 31]).permutation(1 + model.tree.n)
+        loose = np.random.default_rng([seed, 31]).permutation(1 + n)
         loose = loose[: round(self.mounted * len(loose))]
-        mounts = anyhow(seed, loose.tolist(), 1 + model.tree.n)
+        mounts = anyhow(seed, loose.tolist(), 1 + n)
         return record(
-            model, motion, seed, noise=self.noise, base=self.base, parts=self.parts, mounts=mounts
+            name, motion, seed, noise=self.noise, base=self.base, parts=self.parts, mounts=mounts
         )
 
 
@@ -118,7 +118,7 @@ def judge(case: Case, found: Discovery) -> dict[str, Any]:
 
 def trial(robot: str, kind: Kind, seed: int) -> dict[str, Any]:
     """Record, discover, judge."""
-    case = kind.case(model_of(robot), seed)
+    case = kind.case(robot, seed)
     begun = time.process_time()
     found = discover(case.log, base=case.root if kind.named and case.root in case.body else None)
     seconds = time.process_time() - begun
