@@ -16,7 +16,6 @@ from rich.console import Console
 from rich.table import Table
 
 from adapter.discovery import Discovery, discover
-from adapter.model.self_model import SelfModel
 from tests.helpers.benchmark import options, write
 from tests.helpers.discovery_data import TRUSTED, Case, Motion, anyhow, record
 from tests.helpers.discovery_data import robot as model_of
@@ -44,18 +43,19 @@ class Kind:
     mounted: float = 0.0
     named: bool = False
 
-    def case(self, model: SelfModel, seed: int, rate_hz: float) -> Case:
+    def case(self, name: str, seed: int) -> Case:
         """The recording of a seed."""
-        drawn = np.random.default_rng([seed, 23]).permutation(model.tree.n).tolist()
+        n = model_of(name).tree.n
+        drawn = np.random.default_rng([seed, 23]).permutation(n).tolist()
         still = tuple(drawn[: self.resting])
         rest = drawn[self.resting :]
         pairs = tuple((rest[2 * k], rest[2 * k + 1]) for k in range(self.alike))
-        motion = Motion(self.seconds, rate_hz, still, pairs)
-        loose = np.random.default_rng([seed, 31]).permutation(1 + model.tree.n)
+        motion = Motion(self.seconds, 1000.0, still, pairs)
+        loose = np.random.default_rng([seed, 31]).permutation(1 + n)
         loose = loose[: round(self.mounted * len(loose))]
-        mounts = anyhow(seed, loose.tolist(), 1 + model.tree.n)
+        mounts = anyhow(seed, loose.tolist(), 1 + n)
         return record(
-            model, motion, seed, noise=self.noise, base=self.base, parts=self.parts, mounts=mounts
+            name, motion, seed, noise=self.noise, base=self.base, parts=self.parts, mounts=mounts
         )
 
 
@@ -116,9 +116,9 @@ def judge(case: Case, found: Discovery) -> dict[str, Any]:
     }
 
 
-def trial(robot: str, kind: Kind, seed: int, rate_hz: float) -> dict[str, Any]:
+def trial(robot: str, kind: Kind, seed: int) -> dict[str, Any]:
     """Record, discover, judge."""
-    case = kind.case(model_of(robot), seed, rate_hz)
+    case = kind.case(robot, seed)
     begun = time.process_time()
     found = discover(case.log, base=case.root if kind.named and case.root in case.body else None)
     seconds = time.process_time() - begun
@@ -175,21 +175,14 @@ def _print(console: Console, table: list[dict[str, Any]]) -> None:
 def main() -> None:
     """Run the trials asked for."""
     parser = options(__doc__, trials=20, first=0)
-    parser.add_argument("--robot", choices=sorted(ROBOTS), action="append")
-    parser.add_argument("--rate", type=float, default=1000.0, help="samples a second")
     parser.add_argument("--hard", action="store_true", help="hard kinds as well")
-    parser.add_argument("--kind", action="append", help="only kinds whose name holds this")
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     console, rows = Console(width=150), []
-    kinds = [
-        kind
-        for kind in (*USUAL, *(HARD if asked.hard else ()))
-        if not asked.kind or any(part in kind.name for part in asked.kind)
-    ]
-    for robot in asked.robot or ROBOTS:
+    kinds = (*USUAL, *(HARD if asked.hard else ()))
+    for robot in ROBOTS:
         for seed in range(asked.first, asked.first + asked.trials):  # kinds share their motions
-            rows += [trial(robot, kind, seed, asked.rate) for kind in kinds]
+            rows += [trial(robot, kind, seed) for kind in kinds]
             console.print(f"{robot}: seed {seed}", end="\r")
             write(asked.json, {"summary": summary(rows), "rows": rows})
     _print(console, summary(rows))

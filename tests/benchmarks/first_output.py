@@ -1,6 +1,6 @@
 """How long every command takes to say what it does, to explain itself, and to refuse.
 
-    PYTHONPATH=. python tests/benchmarks/first_output.py [--json FILE] [--cold] [--only NAME ...]
+    PYTHONPATH=. python tests/benchmarks/first_output.py [--json FILE] [--cold]
 
 Wall time from pressing enter to the first byte on the standard output or error, and the processor
 time used until then. `--cold`: the files of Python's and this package's code are first put out of
@@ -100,13 +100,10 @@ def main() -> None:
     """Measure and print a table."""
     parser = options(__doc__)
     parser.add_argument("--cold", action="store_true")
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
     args = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as name:
         for what, words in lines(Path(name)).items():
-            if args.only and what not in args.only:
-                continue
             if args.cold:
                 forget_files()
             row = {"command": what, **first_output(words)}

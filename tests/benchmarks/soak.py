@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +51,11 @@ def family(pid: int) -> list[int]:
 
 
 @contextlib.contextmanager
-def simulated(
-    arm: str, share: float, folder: Path, extra: Sequence[str] = ()
-) -> Iterator[tuple[str, Path]]:
+def simulated(arm: str, share: float, folder: Path) -> Iterator[tuple[str, Path]]:
     """A served arm with faults; gives its driver address and where its summary will be."""
     summary = folder / "arm.json"
     command = [sys.executable, "-u", "-m", "adapter", "sim", arm, "--json", str(summary)]
     command += ["--port", "0"] if arm == "fci" else []
-    command += extra
     if share:
         for name in FAULTS:
             command += ["--fault", f"{name}={share}"]

@@ -61,12 +61,12 @@ def floating_panda() -> TreeTruth:
     )
 
 
-def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, OnlineLearner]:
+def learn(robot: str, folder: Path, seconds: float) -> tuple[Row, OnlineLearner]:
     """Learn sample by sample; what came of it and how long the samples took."""
     truth, parts = motions(robot, folder, round(seconds / 10.0) + 1)
-    learned_from = [noisy(part, k) if noise else part for k, part in enumerate(parts[:-1])]
+    learned_from = [noisy(part, k) for k, part in enumerate(parts[:-1])]
     figures, learner = online_trial(learned_from, parts[-1], truth.lam)
-    return {"robot": robot, "noise": noise, **figures}, learner
+    return {"robot": robot, **figures}, learner
 
 
 def parts_of(learner: OnlineLearner, data: TreeData, repeats: int) -> Row:
@@ -106,8 +106,7 @@ def parts_of(learner: OnlineLearner, data: TreeData, repeats: int) -> Row:
 
 def print_row(row: Row) -> None:
     """One robot's table."""
-    noise = "with noise" if row["noise"] else "without noise"
-    print(f"\n{row['robot']}, {row['joints']} joints, floating base, free fall, {noise}")
+    print(f"\n{row['robot']}, {row['joints']} joints, floating base, free fall, with noise")
     print(
         f"  a sample: p50 {row['step_p50_us']:.0f} µs, p99 {row['step_p99_us']:.0f} µs; "
         f"{row['samples_per_second']:.0f} a second on one core"
@@ -131,15 +130,13 @@ def main() -> None:
     parser = options("The online learner on whole robots.")
     parser.add_argument("--robot", nargs="+", default=["atlas", "panda"])
     parser.add_argument("--seconds", type=float, default=30.0, help="of motion to learn from")
-    parser.add_argument("--data", type=Path, help="folder of the simulated motions")
-    parser.add_argument("--exact", action="store_true", help="without noise")
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
     with tempfile.TemporaryDirectory() as made:
-        folder = args.data or Path(made)
+        folder = Path(made)
         for robot in args.robot:
-            row, learner = learn(robot, folder, args.seconds, not args.exact)
+            row, learner = learn(robot, folder, args.seconds)
             data = motions(robot, folder, 1)[1][0]
             row["parts_p50_us"] = parts_of(learner, data, 500)
             print_row(row)

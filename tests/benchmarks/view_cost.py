@@ -2,10 +2,10 @@
 
 One live run of the simulated Panda, cut into pairs of stretches: without the view (its process
 stopped, the browser on an empty page) and with it (drawn in headless Chromium); which comes first
-alternates. The loop's own counts are read at the edges. `--whole N` adds N pairs of whole runs.
+alternates. The loop's own counts are read at the edges.
 
 The view runs only where nobody else wants the processor, so that on a busy machine it costs
-nothing; `--awake` gives it ordinary priority, which it never has: more than it ever costs.
+nothing.
 """
 
 from __future__ import annotations
@@ -40,25 +40,21 @@ EMPTY = "about:blank"
 
 
 @contextmanager
-def live_run(
-    seconds: float, folder: Path, view: bool
-) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`adapter run`, and where it can be watched ("" where it cannot)."""
-    command = [sys.executable, "-u", "-m", "adapter", "run", "--duration", str(seconds)]
-    command += ["--seed", "5", "--quiet"]
-    command += ["--out", str(folder), "--json", str(folder / "figures.json")]
-    command += ["--view", "0"] if view else []
+def live_run(folder: Path) -> Iterator[tuple[int, str]]:
+    """The process of `adapter run`, and where it can be watched."""
+    command = [sys.executable, "-u", "-m", "adapter", "run", "--duration", str(ENDLESS_S)]
+    command += ["--seed", "5", "--quiet", "--out", str(folder), "--view", "0"]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:
         address = ""
         assert run.stderr is not None
-        while view and not address:
+        while not address:
             line = run.stderr.readline()
             found = re.search(r"http://\S+", line)
             address = found.group(0) if found else ""
             if not line:
                 raise SystemExit("the run did not start")
-        yield run, address
+        yield run.pid, address
     finally:  # what it has learned and recorded is of no interest, and may take long to finish
         for pid in reversed(family(run.pid)):
             with suppress(ProcessLookupError):
@@ -123,27 +119,15 @@ def added(parts: list[LoopTiming]) -> LoopTiming:
     return LoopTiming(np.asarray(bins), *missed)
 
 
-def wake(pid: int) -> None:
-    """Give all threads of a view this process's priority, once it has given its own away."""
-    end = time.monotonic() + START_S
-    while os.sched_getscheduler(pid) != os.SCHED_IDLE and time.monotonic() < end:
-        time.sleep(0.05)
-    for thread in Path(f"/proc/{pid}/task").iterdir():
-        os.sched_setscheduler(int(thread.name), os.SCHED_OTHER, os.sched_param(0))
-        os.setpriority(os.PRIO_PROCESS, int(thread.name), os.getpriority(os.PRIO_PROCESS, 0))
-
-
-def in_one_run(pairs: int, seconds: float, awake: bool) -> dict[str, Any]:
+def in_one_run(pairs: int, seconds: float) -> dict[str, Any]:
     """See the module."""
     found: dict[bool, list[LoopTiming]] = {True: [], False: []}
     with (
         tempfile.TemporaryDirectory() as folder,
         tab(Path(folder)) as page,
-        live_run(ENDLESS_S, Path(folder) / "run", view=True) as (run, address),
+        live_run(Path(folder) / "run") as (run, address),
     ):
-        pid, name = view_process(run.pid)
-        if awake:
-            wake(pid)
+        pid, name = view_process(run)
         board = LoopBoard(SharedBlock.attach(name))
         page.open(address)
         page.wait_for("!!document.getElementById('clock')?.textContent", START_S)
@@ -161,7 +145,6 @@ def in_one_run(pairs: int, seconds: float, awake: bool) -> dict[str, Any]:
         board.close()
     ratios = {what: _ratios(found, what) for what in ("loop_us", "tick_us")}
     return {
-        "awake": awake,
         "pairs": pairs,
         "seconds_each": seconds,
         "without": percentiles(added(found[False])),
@@ -191,36 +174,14 @@ def _ratios(found: dict[bool, list[LoopTiming]], what: str) -> dict[str, Any]:
     }
 
 
-def whole_runs(pairs: int, seconds: float) -> list[dict[str, Any]]:
-    """Pairs of whole runs."""
-    rows = []
-    for k in range(pairs):
-        row: dict[str, Any] = {}
-        for watched in (k % 2 == 0, k % 2 == 1):
-            with tempfile.TemporaryDirectory() as folder, tab(Path(folder)) as page:
-                out = Path(folder) / "run"
-                with live_run(seconds, out, watched) as (run, address):
-                    if watched:
-                        page.open(address)
-                    run.communicate()
-                timing = json.loads((out / "figures.json").read_text())["timing"]
-            row["with" if watched else "without"] = {what: timing[what] for what in WATCHED}
-        rows.append(row)
-    return rows
-
-
 def main() -> None:
     """Command line."""
     parser = options(__doc__)
     parser.add_argument("--pairs", type=int, default=8, help="of stretches in the run (default 8)")
     parser.add_argument("--seconds", type=float, default=8.0, help="of a stretch (default 8)")
-    parser.add_argument("--whole", type=int, default=0, help="pairs of whole runs beside it")
-    parser.add_argument("--awake", action="store_true", help="the view at ordinary priority")
     args = parser.parse_args()
     load = os.getloadavg()[0]
-    told = {"load_before": load, "one_run": in_one_run(args.pairs, args.seconds, args.awake)}
-    if args.whole:
-        told["whole_runs"] = whole_runs(args.whole, 20.0)
+    told = {"load_before": load, "one_run": in_one_run(args.pairs, args.seconds)}
     told["load_after"] = os.getloadavg()[0]
     print(json.dumps(told, indent=1))
     write(args.json, told)

@@ -38,7 +38,7 @@ def process_time_ns(pid: int) -> int:
 
 
 @contextmanager
-def busy_thread(wanted: bool) -> Iterator[None]:
+def busy_thread() -> Iterator[None]:
     """Another Python thread that never rests."""
     done = threading.Event()
 
@@ -47,24 +47,21 @@ def busy_thread(wanted: bool) -> Iterator[None]:
         while not done.is_set():
             count += 1
 
-    thread = threading.Thread(target=spin, daemon=True)
-    if wanted:
-        thread.start()
+    threading.Thread(target=spin, daemon=True).start()
     try:
         yield
     finally:
         done.set()
 
 
-def fci(minutes: float, protocol: int, busy: bool) -> dict[str, Any]:
+def fci(minutes: float) -> dict[str, Any]:
     """Only listening, as fast as the robot sends."""
     from drivers.fci import FciArm
 
     count = round(60e3 * minutes)
     ages, used = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    extra = ["--protocol", str(protocol)]
-    with tempfile.TemporaryDirectory() as folder, busy_thread(busy):
-        with simulated("fci", 0.0, Path(folder), extra) as (address, summary):
+    with tempfile.TemporaryDirectory() as folder, busy_thread():
+        with simulated("fci", 0.0, Path(folder)) as (address, summary):
             arm = FciArm(address)
             arm.connect()
             arm.read()
@@ -84,8 +81,6 @@ def fci(minutes: float, protocol: int, busy: bool) -> dict[str, Any]:
             arm.close()
         served = json.loads(summary.read_text())
     return {
-        "protocol": protocol,
-        "busy_thread": busy,
         "samples": count,
         "lost": intake.lost,
         "dropped_by_the_kernel": drops,
@@ -188,21 +183,14 @@ def can_udp(minutes: float) -> dict[str, Any]:
 def main() -> None:
     """Measure what was asked for; print and write."""
     parser = options(__doc__, minutes=0.5)
-    kinds = ("fci", "virtual", "udp")
+    kinds = {"fci": fci, "virtual": can_virtual, "udp": can_udp}
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(kinds)}")
-    parser.add_argument("--protocol", type=int, choices=(5, 10), default=5)
-    parser.add_argument("--quiet-machine", action="store_true", help="no busy thread beside fci")
     args = parser.parse_args()
     found: dict[str, Any] = {}
     for kind in args.kinds or kinds:
-        if kind == "fci":
-            found[kind] = fci(args.minutes, args.protocol, not args.quiet_machine)
-        elif kind == "virtual":
-            found[kind] = can_virtual(args.minutes)
-        elif kind == "udp":
-            found[kind] = can_udp(args.minutes)
-        else:
+        if kind not in kinds:
             parser.error(f"no kind '{kind}'; have: {', '.join(kinds)}")
+        found[kind] = kinds[kind](args.minutes)
         print(kind, json.dumps(found[kind], indent=1), flush=True)
     write(args.json, found)
 

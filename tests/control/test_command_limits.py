@@ -202,8 +202,10 @@ def test_by_stamps_alone_no_command_is_too_much_and_no_reference_too_fast(faults
 
 @cache
 def _calm():
-    """Speeds of the arm without faults."""
-    return _run([])[0]
+    """Speeds of the arm without faults, where nothing is refused."""
+    speeds, said, controller = _run([])
+    assert said is None and controller.tracking()["unusable"] == 0
+    return speeds
 
 
 def _run(faults: list[Fault]):
@@ -212,11 +214,6 @@ def _run(faults: list[Fault]):
     controller.attend(arm)
     said = played(arm, controller, faults, None, lambda: 0.0).said
     return np.array(arm.speeds), said, controller
-
-
-def test_without_faults_nothing_is_refused():
-    _, said, controller = _run([])
-    assert said is None and controller.tracking()["unusable"] == 0
 
 
 @pytest.mark.parametrize("size", [-0.3, 0.05])

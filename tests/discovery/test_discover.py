@@ -21,7 +21,6 @@ from tests.helpers.discovery_data import (
     Motion,
     confidences,
     record,
-    robot,
 )
 
 NO_TURNING = (1, 1, 1, 0, 0, 0)
@@ -29,7 +28,7 @@ NO_TURNING = (1, 1, 1, 0, 0, 0)
 
 @cache
 def _case(name: str, motion: Motion, seed: int, noise: float = 1.0) -> Case:
-    return record(robot(name), motion, seed, noise=noise)
+    return record(name, motion, seed, noise=noise)
 
 
 def _worst_wrong(case: Case, found: Discovery) -> float:

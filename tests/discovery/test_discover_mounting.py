@@ -50,11 +50,10 @@ def _case(
     noise: float = 1.0,
     base: bool | None = None,
 ) -> Case:
-    model = robot(name)
-    bodies = 1 + model.tree.n
+    bodies = 1 + robot(name).tree.n
     which = np.random.default_rng([seed, 31]).permutation(bodies)[: round(share * bodies)]
     mounts = anyhow(seed, which.tolist(), bodies, turned=turned, shifted=shifted)
-    return record(model, motion, seed, noise=noise, base=base, mounts=mounts)
+    return record(name, motion, seed, noise=noise, base=base, mounts=mounts)
 
 
 def _pairs(case: Case) -> set[tuple[str, frozenset[str]]]:
@@ -272,10 +271,9 @@ JITTER_NS = 200_000  # of all stamps
 
 
 @cache
-def _glued(seed: int, floating: bool, base: bool) -> Case:
-    model = robot("panda").with_base(floating)
+def _glued(seed: int, name: str, base: bool) -> Case:
     mounts = anyhow(seed, range(8), 8)
-    return record(model, FINE, seed, base=base, noise=0.5, mounts=mounts)
+    return record(name, FINE, seed, base=base, noise=0.5, mounts=mounts)
 
 
 def _write(
@@ -310,7 +308,7 @@ def _edges(figures: dict) -> set[tuple[str, str, str]]:
 
 
 def test_command_finds_the_tree_of_glued_sensors(tmp_path, capsys) -> None:
-    case = _glued(0, False, True)
+    case = _glued(0, "panda", True)
     path = _write(tmp_path / "a.mcap", case, str)
     model = tmp_path / "model.json"
     figures = _discovered(path, "--model", str(model))
@@ -334,7 +332,7 @@ def test_command_finds_the_tree_of_glued_sensors(tmp_path, capsys) -> None:
 
 
 def test_sensors_of_one_frame_id_and_torques(tmp_path) -> None:
-    case = _glued(1, False, False)
+    case = _glued(1, "panda", False)
     path = _write(tmp_path / "a.mcap", case, lambda _: "imu_link", dq=True, tau=True)
     figures = _discovered(path, "--model", str(tmp_path / "model.json"))
     topics = {(j, f"/{k}/data", f"/{i}/data" if i != "base" else i) for j, k, i in case.edges}
@@ -343,7 +341,7 @@ def test_sensors_of_one_frame_id_and_torques(tmp_path) -> None:
 
 
 def test_floating_base_needs_a_word(tmp_path, capsys, refused) -> None:
-    case = _glued(2, True, True)
+    case = _glued(2, "free panda", True)
     path = _write(tmp_path / "a.mcap", case, str, dq=True)
     assert any("--base" in line for line in _discovered(path)["undecided"])
     assert "this way or the other" in capsys.readouterr().out
@@ -353,7 +351,7 @@ def test_floating_base_needs_a_word(tmp_path, capsys, refused) -> None:
 
 
 def test_other_commands_see_nothing_of_it(tmp_path) -> None:
-    path = _write(tmp_path / "a.mcap", _glued(1, False, False), str, tau=True)
+    path = _write(tmp_path / "a.mcap", _glued(1, "panda", False), str, tau=True)
     log = read_log(path)
     assert log.link_names == () and log.twists is None and np.isfinite(log.tau).all()
     bare = foreign(tmp_path / "b.mcap", payloads(samples(5), fields=("position", "velocity")))
@@ -369,7 +367,7 @@ def test_other_commands_see_nothing_of_it(tmp_path) -> None:
 
 
 def test_a_part_is_that_part_of_the_whole(tmp_path, refused) -> None:
-    path = _write(tmp_path / "a.mcap", _glued(1, False, False), str)
+    path = _write(tmp_path / "a.mcap", _glued(1, "panda", False), str)
     whole = read_log(path, beside="sensors")
     part = read_log(path, beside="sensors", within_s=(1.0, 2.0))
     at = np.searchsorted(whole.stamp_ns, part.stamp_ns)

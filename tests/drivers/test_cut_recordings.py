@@ -111,15 +111,17 @@ def test_a_cut_at_any_byte(whole, ends, place, share):
 
 @pytest.mark.parametrize("compression", CompressionType)
 @pytest.mark.parametrize("chunking", [True, False])
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
-def test_cut_files_of_others(tmp_path, compression, chunking, share):
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9, 1.0])
+def test_files_of_others_whole_and_cut(tmp_path, compression, chunking, share):
     path = foreign(tmp_path / "a.mcap", payloads(ITEMS), "/joint_states", compression, chunking)
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     log = read_log(path)
-    assert log.truncated
-    assert len(log) > 0.5 * share * COUNT
-    assert np.array_equal(log.tau, TORQUES[: len(log)])
+    assert log.truncated == (share < 1.0) and bool(log.warnings) == log.truncated
+    assert len(log) > 0.5 * share * COUNT and (log.truncated or len(log) == COUNT)
+    for name in ("stamp_ns", "q", "dq", "tau"):
+        expected = [getattr(s, name) for s in ITEMS[: len(log)]]
+        assert np.array_equal(getattr(log, name), expected), name
 
 
 def test_the_readable_part_of_a_cut_chunk_is_read(tmp_path):

@@ -77,6 +77,8 @@ def test_a_listener_is_a_driver_and_changes_nothing(moving):
     assert arm.intake.commands is None
     with pytest.raises(DriverError, match="allow motion"):
         arm.command(np.zeros(N))
+    with pytest.raises(DriverError, match="connected already"):
+        arm.connect()
 
 
 def test_samples_are_of_one_instant(moving):
@@ -480,17 +482,6 @@ def test_a_time_out_of_a_former_run_is_cleared(opened):
     bus.bank.status = [0xD] * N
     opened(bus, allow_motion=True)
     assert bus.bank.status == [1] * N
-
-
-def test_it_is_connected_once_and_again_after_its_end(moving):
-    arm, _ = moving
-    with pytest.raises(DriverError, match="connected already"):
-        arm.connect()
-    arm.close()
-    with pytest.raises(DriverError, match="not connected"):
-        arm.read()
-    arm.connect()
-    assert np.isfinite(arm.read().tau).all()
 
 
 @pytest.mark.parametrize(

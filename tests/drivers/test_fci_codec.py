@@ -99,13 +99,10 @@ def test_golden_requests():
     assert codec.request(12, 5) == struct.pack("<III", 12, 5, 12)
 
 
-@pytest.mark.parametrize("size", [0, 11, 1 << 30])
-def test_an_impossible_reply_length_is_refused(size):
-    with pytest.raises(WireError, match=f"says {size} bytes"):
-        codec.ReplyParser().feed(struct.pack("<III", 1, 2, size))
-
-
-def test_replies_cut_short_are_refused():
+def test_impossible_replies_are_refused():
+    for size in (0, 11, 1 << 30):
+        with pytest.raises(WireError, match=f"says {size} bytes"):
+            codec.ReplyParser().feed(struct.pack("<III", 1, 2, size))
     with pytest.raises(WireError, match="without a status"):
         codec.status_reply(b"")
     with pytest.raises(WireError, match="14 bytes; it has 15"):

@@ -673,9 +673,12 @@ def test_a_reflex_and_a_user_stop_are_notes_while_only_reading(peer5, connected)
     assert "user stop pressed" in notes
 
 
-def test_a_robot_without_the_finish_flag_is_stopped_over_tcp(in_motion):
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_stop_that_the_finish_flag_does_not_make_goes_over_tcp(in_motion, silent):
     arm, peer = in_motion
     peer.obeys_finish = False
+    if silent:
+        peer.pause()
     arm.stop()
     assert peer.requests[-1][0] == fci_peer.STOP_MOVE
     assert peer.modes == (0, 3, 1)
@@ -689,13 +692,6 @@ def test_a_stop_that_nobody_confirms_ends_and_says_so(in_motion):
         arm.stop()
     assert time.monotonic() - begin < LIMIT_S
     arm.stop()
-
-
-def test_a_stop_without_states_goes_over_tcp(in_motion5):
-    arm, peer = in_motion5
-    peer.pause()
-    arm.stop()
-    assert peer.requests[-1][0] == fci_peer.STOP_MOVE
 
 
 def test_the_connection_cut_in_a_motion(in_motion5):

@@ -5,14 +5,11 @@ Decoders and good inputs are those of the trials, of which there are a million.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.damiao import codec as damiao
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.bus import UNREADABLE, unpack_datagram
 from drivers.damiao.tables import troubles_of
@@ -24,7 +21,6 @@ from tests.helpers import fci_peer
 from tests.helpers.damiao_tools import LIMITS, Bank, MotorBus, reply_bytes, tick
 
 MANY = 10_000
-SCALES = damiao.Scales(*LIMITS[0])
 
 
 @pytest.fixture(scope="module")
@@ -85,18 +81,6 @@ def test_replies_come_through_unchanged(payloads: list[bytes], cuts: list[int]) 
     parser, ends = ReplyParser(), zip([0, *places], [*places, len(stream)], strict=True)
     got = [reply for begin, end in ends for reply in parser.feed(stream[begin:end])]
     assert got == [Reply(k, payload) for k, payload in enumerate(payloads)]
-
-
-@settings(max_examples=300, deadline=None)
-@given(*[st.floats(allow_nan=True, allow_infinity=True)] * 5)
-def test_commands(q: float, dq: float, kp: float, kd: float, tau: float) -> None:
-    values = (q, dq, kp, kd, tau)
-    if any(math.isnan(value) for value in values):
-        with pytest.raises(damiao.WireError, match="not a number"):
-            damiao.mit_command(SCALES, *values)
-        return
-    data = damiao.mit_command(SCALES, *values)
-    assert len(data) == 8 and data[:7] != b"\xff" * 7
 
 
 @settings(max_examples=300, deadline=None)

@@ -113,13 +113,6 @@ def test_bristle_friction_is_dahls(s0: float) -> None:
     assert relative(late, on_joint(0.8 * ours * (T >= 2.0))) < 1e-9
 
 
-def test_bristles_rest_where_they_are_and_slide_like_coulombs() -> None:
-    q = np.concatenate([np.linspace(0.0, 0.1, 50), np.full(30, 0.1), np.linspace(0.1, 0.099, 9)])
-    z = bending(q, 1e-3)
-    np.testing.assert_allclose(z[20:80], 1.0)
-    assert z[-1] == pytest.approx(2.0 * np.exp(-1.0) - 1.0)  # one s0 back from sliding
-
-
 @pytest.mark.parametrize("hz", [20.0, 5.0])
 def test_torque_filter_is_a_low_pass(hz: float) -> None:
     """Of second order, solved as a differential equation; friction's jumps go through it, too."""

@@ -286,14 +286,10 @@ def test_a_checkpoint_goes_on_where_it_was(tmp_path: Path) -> None:
     settings = PipelineSettings(learner=LearnerSettings(effects=FRICTION))
     whole, first, second = (make_learner(model, settings) for _ in range(3))
     states = states_of(record(arm(), MOTION).part(3.0), model)
-    for k, state in enumerate(states):
-        whole.step(state)
-        if k < 1500:
-            first.step(state)
-    save_checkpoint(first, tmp_path / "half.npz")
+    save_checkpoint(teach(first, states[:1500], rows=1), tmp_path / "half.npz")
     load_checkpoint(second, tmp_path / "half.npz")
-    for state in states[1500:]:
-        second.step(state)
+    for learner, part in ((whole, states), (second, states[1500:])):
+        teach(learner, part, rows=1)
     np.testing.assert_array_equal(whole.theta.th, second.theta.th)
     for other in (panda_model(), with_effects(*wrong_friction(0.5, 0.1).effects)):
         with pytest.raises(SettingsError, match="other learner settings"):

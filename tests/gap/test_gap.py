@@ -150,12 +150,17 @@ def outside(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return Told(trial, tmp_path_factory.mktemp(request.param), pinocchio_recording)
 
 
-def test_effect_is_named_on_its_joint(single: Told) -> None:
-    assert single.own, single
-
-
-def test_nothing_else_is_named(single: Told) -> None:
-    assert not single.row["wrong"], single
+def test_effect_and_nothing_else_is_named_on_its_joint(single: Told) -> None:
+    """With how sure that is, and what it could also be."""
+    assert single.own and not single.row["wrong"], single
+    assert max(f["evidence"] for f in single.own) > 0.5, single
+    for f in single.result["findings"]:
+        assert 0.0 <= f["evidence"] <= 1.0
+        assert set(f["units"]) >= set(f["parameters"])
+        assert set(f["std"]) == set(f["parameters"])
+        assert len(f["ambiguous_with"]) <= 3
+        assert all(0.9 <= share <= 1.0 for share in f["overlap"].values())
+        assert f["split_by"] or not f["ambiguous_with"]
 
 
 def test_parameters_are_right(single: Told) -> None:
@@ -186,18 +191,6 @@ def test_torque_error_falls_on_data_held_out(single: Told) -> None:
         assert after[joint] < 0.7 * before[joint], (before, after)
 
 
-def test_a_name_says_how_sure_it_is(single: Told) -> None:
-    assert single.own, single
-    assert max(f["evidence"] for f in single.own) > 0.5, single
-    for f in single.result["findings"]:
-        assert 0.0 <= f["evidence"] <= 1.0
-        assert set(f["units"]) >= set(f["parameters"])
-        assert set(f["std"]) == set(f["parameters"])
-        assert len(f["ambiguous_with"]) <= 3
-        assert all(0.9 <= share <= 1.0 for share in f["overlap"].values())
-        assert f["split_by"] or not f["ambiguous_with"]
-
-
 @pytest.mark.parametrize("seed", some_slow(NULLS))
 def test_noise_and_a_slightly_wrong_model_have_no_name(seed: int, tmp_path: Path) -> None:
     result = answer(draw(seed, "null", rubs=False), tmp_path, pinocchio_recording)
@@ -210,9 +203,6 @@ def test_what_is_in_no_list_gets_a_law_or_stays_unexplained(outside: Told) -> No
     assert any(same_joints(x, outside.truth) for x in left), outside
     for x in outside.result["unexplained"]:
         assert x["depends_on"] and x["rmse_nm"] > x["noise_floor_nm"]
-
-
-def test_what_is_in_no_list_gets_no_sure_name(outside: Told) -> None:
     assert outside.row["sure_wrong"] == 0, outside
 
 

@@ -80,13 +80,6 @@ def test_standard_deviations_are_honest(with_empty: bool) -> None:
     assert np.abs(z).max() < 4.0
 
 
-def test_inertia_shows_in_ten_seconds() -> None:
-    log, _, load = logs(12, 0.02, Motion(10.0, 12))
-    found = find_load(log, panda_model())
-    assert found.inertia_shown and np.abs(off(found, load)).max() < 4.0
-    assert (found.left_nm < 0.1 * found.before_nm)[1:6].all()
-
-
 def test_at_rest_the_mass_shows_and_the_inertia_does_not() -> None:
     log, empty, load = logs(5, 0.03, REST)
     alone = find_load(log, panda_model())
@@ -107,12 +100,14 @@ def test_an_empty_hand_carries_nothing() -> None:
     assert as_json(found)["com_m"] is None
 
 
-def test_the_load_is_told_in_the_frame_asked_for() -> None:
+def test_inertia_shows_in_ten_seconds_in_the_frame_asked_for() -> None:
     """Against Pinocchio's way to change frames."""
-    log, _, _ = logs(12, 0.02, Motion(10.0, 12))
+    log, _, load = logs(12, 0.02, Motion(10.0, 12))
     grip = FixedFrame("grip", "grip_joint", "panda_link7", rot_x(0.7), np.array([0.1, 0.0, 0.2]))
     model = replace(panda_model(), frames=(*panda_model().frames, grip))
     flange, there = find_load(log, model), find_load(log, model, frame="grip")
+    assert flange.inertia_shown and np.abs(off(flange, load)).max() < 4.0
+    assert (flange.left_nm < 0.1 * flange.before_nm)[1:6].all()
     assert (flange.frame, there.frame) == ("panda_link8", "grip")
     place = pin.SE3(grip.rotation, grip.position - FLANGE)
     body = place.actInv(pin.Inertia(flange.mass, flange.com, flange.inertia))

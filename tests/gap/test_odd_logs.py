@@ -110,10 +110,9 @@ def test_the_load_is_that_of_the_log_without_the_flaw(name: str) -> None:
     assert found.left_nm.max() < 0.5
 
 
-@pytest.mark.parametrize(("name", "said"), [("spikes of 50 times", f"{SPIKES} samples hold")])
-def test_what_was_left_out_is_told(name: str, said: str) -> None:
-    found = adapter.find_gap(ODD[name](), panda_model())
-    assert any(said in note for note in found.notes)
+def test_what_was_left_out_is_told() -> None:
+    found = adapter.find_gap(spiked(50.0), panda_model())
+    assert any(f"{SPIKES} samples hold" in note for note in found.notes)
     assert [x.effect for x in found.findings if x.effect == "payload"] == ["payload"]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +65,10 @@ class Case:
 
 @cache
 def robot(name: str) -> SelfModel:
-    """The Panda on its fixed base or ATLAS on a free one; a test skips where it is not at hand."""
-    return documented("panda") if name == "panda" else read_quietly(urdf_text(name), floating=True)
+    """The Panda on its fixed base or a free one ("free panda"), or ATLAS, whose test may skip."""
+    if name == "atlas":
+        return read_quietly(urdf_text(name), floating=True)
+    return documented("panda").with_base(name == "free panda")
 
 
 def _sines(rng: np.random.Generator, t: np.ndarray, n: int, speed: float) -> tuple[np.ndarray, ...]:
@@ -137,26 +139,17 @@ def _seen(
     return twists, accels
 
 
-_DRAWN: dict[tuple[int, Motion, int], tuple[SelfModel, tuple[np.ndarray, ...], np.random.Generator]]
-_DRAWN = {}
-
-
+@lru_cache(DRAWN_KEPT)
 def _drawn(
-    model: SelfModel, motion: Motion, seed: int
+    name: str, motion: Motion, seed: int
 ) -> tuple[tuple[np.ndarray, ...], np.random.Generator]:
-    """The motion of a seed, and its generator as that left it; the latest few are kept."""
-    key = id(model), motion, seed
-    if key not in _DRAWN:
-        while len(_DRAWN) >= DRAWN_KEPT:
-            del _DRAWN[next(iter(_DRAWN))]
-        rng = np.random.default_rng([seed, 17])
-        _DRAWN[key] = model, _moved(model, motion, rng), rng
-    _, moved, rng = _DRAWN[key]
-    return moved, copy.deepcopy(rng)
+    """The motion of a seed, and its generator as that left it."""
+    rng = np.random.default_rng([seed, 17])
+    return _moved(robot(name), motion, rng), rng
 
 
 def record(
-    model: SelfModel,
+    name: str,
     motion: Motion,
     seed: int,
     *,
@@ -165,7 +158,7 @@ def record(
     parts: str = "ta",
     mounts: tuple[tuple[np.ndarray, np.ndarray], ...] = (),
 ) -> Case:
-    """A shuffled recording.
+    """A shuffled recording of `robot(name)`.
 
     Args:
         noise: times that of real parts.
@@ -173,8 +166,8 @@ def record(
         parts: "t" with twists, "a" with accelerations.
         mounts: (rotation, place) of the sensor of each body, the base first, in its joint frame.
     """
-    moved, rng = _drawn(model, motion, seed)
-    q, dq, _, tau, twists, accels = moved
+    (q, dq, _, tau, twists, accels), rng = copy.deepcopy(_drawn(name, motion, seed))
+    model = robot(name)
     twists, accels = _seen(twists, accels, mounts)
     root = np.sqrt(motion.rate_hz / 2)
     q = np.round(q / ENCODER_STEP) * ENCODER_STEP

@@ -1,8 +1,8 @@
 """A scripted robot for the tests of the FCI driver: sockets, no physics.
 
 Frames are made with `struct` from the offsets of the reference tables, without the driver's code.
-`python tests/fci_peer.py PROTOCOL COUNT RATE` streams COUNT states from a process of its own: it
-prints its port, waits for Connect and prints a line when all are sent.
+`python tests/fci_peer.py PROTOCOL RATE` streams states from a process of its own: it prints its
+port and waits for Connect.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOVE, STOP_MOVE, RECOVER = 1, 2, {5: 12, 10: 10}
 RUNNING = {5: 2, 10: 5}  # generator mode of a torque motion
 STARTED, NOT_POSSIBLE = 1, {5: 3, 10: 5}
 REFLEX, USER_STOP = {5: 6, 10: 8}, {5: 7, 10: 9}
-ZERO = (0.0,) * 7
+ZERO, PERIOD_S = (0.0,) * 7, 1e-3
 
 
 def state(
@@ -81,7 +81,7 @@ class Peer:
     """Serves one connection after the other on a port of 127.0.0.1.
 
     Connect is answered by `connect_reply`, a function of the version asked for; then one state
-    per `period_s` goes out while `streaming` is set. Move, StopMove and recovery are answered as
+    a millisecond goes out while `streaming` is set. Move, StopMove and recovery are answered as
     the first attributes say; the robot's modes follow.
 
     Attributes:
@@ -95,8 +95,8 @@ class Peer:
         requests: (command, payload) received.
     """
 
-    def __init__(self, protocol: int, period_s: float = 1e-3) -> None:
-        self.protocol, self.period_s = protocol, period_s
+    def __init__(self, protocol: int) -> None:
+        self.protocol = protocol
         self.first_status = STARTED
         self.stop_status: int | None = 0
         self.recover_status: int | None = 0
@@ -259,7 +259,7 @@ class Peer:
     def _stream(self) -> None:
         due = time.monotonic()
         while not self._over.is_set():
-            due = max(due + self.period_s, time.monotonic() - 0.05)
+            due = max(due + PERIOD_S, time.monotonic() - 0.05)
             time.sleep(max(0.0, due - time.monotonic()))
             with self._lock:
                 if self.streaming.is_set() and self._where is not None:

@@ -151,7 +151,6 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     outside = [r for r in rows if r["kind"] == "outside"]
     singles = [r for r in rows if r["kind"] == "single" and _strong(r)]
     rubbed = [r for r in rows if r["rubs"]]
-    weak = [r for r in rows if r["kind"] in ("single", "pair") and not _strong(r)]
     both = [r for r in pairs if r["strong"] == len(r["effects"])]
     seen = [r for r in outside if _strong(r)]
     parameters = [ok for r in singles for ok in r["parameters"]]
@@ -159,17 +158,14 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     counts = {
         "single_named": [r["named"] > 0 for r in singles],
         "single_exact": [r["exact"] for r in singles],
-        "single_false_extra": [bool(r["wrong"]) for r in singles],
         "parameters": parameters,
         "null_false": [bool(r["wrong"]) for r in nulls],
         "rubbed_named": [r["named"] > 0 for r in singles if r["rubs"]],
         "rubbed_clean": [not r["wrong"] for r in rubbed if r["kind"] != "outside"],
         "pair_both_named": [r["named"] == r["strong"] for r in both],
-        "pair_strong_named": [n < r["named"] for r in pairs for n in range(r["strong"])],
         "dated": [error <= DATE_S for error in dates],
         "outside_unexplained": [r["unexplained"] for r in seen],
         "outside_sure_wrong": [r["sure_wrong"] > 0 for r in seen],
-        "weak_false": [bool(r["wrong"]) for r in weak],
         "torque_ratio": [r["torque_ratio"] <= 1.2 for r in rows if r.get("torque_ratio")],
         "rollout_ratio": [r["rollout_ratio"] <= 1.3 for r in rows if r.get("rollout_ratio")],
     }
@@ -214,17 +210,14 @@ def confusion(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
 GOALS = {
     "single_named": ("single effects named, or in the ambiguity set", ">= 95 %"),
     "single_exact": ("single effects: exactly the right set and joint", ">= 90 %"),
-    "single_false_extra": ("single effects with a wrong name on top", ""),
     "parameters": ("parameters within 10 % or 3 std", ">= 90 %"),
     "null_false": ("nulls given a name", "<= 2 %"),
     "rubbed_named": ("beside friction in every joint: single named", ">= 95 %"),
     "rubbed_clean": ("beside friction in every joint: no wrong name", ">= 95 %"),
     "pair_both_named": ("pairs: both named", ">= 80 %"),
-    "pair_strong_named": ("pairs: strong members named", ""),
     "dated": ("starts dated within 0.3 s", ">= 90 %"),
     "outside_unexplained": ("outside the catalogue: unexplained, or a law", ">= 80 %"),
     "outside_sure_wrong": ("outside: wrong name with evidence > 0.9", "<= 10 %"),
-    "weak_false": ("weak draws given a wrong name", ""),
     "torque_ratio": ("held-out torque within 1.2 of the oracle's", "all"),
     "rollout_ratio": ("forward simulation within 1.3 of the oracle's", "all"),
 }

@@ -117,14 +117,6 @@ def test_no_circle_between_rooms() -> None:
     need_no_circle(arrows)
 
 
-@pytest.mark.parametrize(
-    ("source", "forbidden"), [("sim", "adapter"), ("drivers", "adapter"), ("drivers", "sim")]
-)
-def test_truth_and_drivers_know_no_learner(source: str, forbidden: str) -> None:
-    chain = graph().find_shortest_chain(source, forbidden, as_packages=True)
-    assert chain is None, " -> ".join(chain or ())
-
-
 def test_the_experiments_are_known_to_the_command_alone() -> None:
     whole = graph()
     inside = {m for m in whole.modules if m.startswith("adapter.experiments")}

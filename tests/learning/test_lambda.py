@@ -85,15 +85,6 @@ def test_lambda_comes_back_and_stays(kind: str, within_s: float, seed: int) -> N
     assert found.learner.schema.rank == found.seen.rank
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_source_is_told(kind: str) -> None:
-    learner = run(kind, 0).learner
-    model = learned_model(collect(learner), panda_model())
-    measured = kind == "measured"
-    assert model.lambda_source == (LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED)
-    assert collect(learner).lam_measured is measured
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_not_shown_stays_at_the_start(kind: str, seed: int) -> None:
@@ -105,7 +96,9 @@ def test_what_is_not_shown_stays_at_the_start(kind: str, seed: int) -> None:
     slack = 1e-12 if kind == "synthesized" else 1e-3
     assert learner.schema.p[1, 2] == pytest.approx(start[1, 5], abs=slack)
     assert np.abs(outcome.lam_covariance[0, 3:]).max() == 0.0
-    model = learned_model(outcome, panda_model())
+    model, measured = learned_model(outcome, panda_model()), kind == "measured"
+    assert model.lambda_source == (LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED)
+    assert outcome.lam_measured is measured
     assert not model.lam_identifiable[0, 2:].any()
     assert model.lam_identifiable[0, :2].all()
     assert not model.lam_identifiable[1, 5]

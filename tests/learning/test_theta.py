@@ -82,8 +82,11 @@ def batch_theta(learner: OnlineLearner, data: ArmData) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_as_good_as_batch_least_squares(seed: int) -> None:
-    learner, _, data = plain(seed)
+def test_as_good_as_batch_least_squares_and_a_possible_body_at_every_step(seed: int) -> None:
+    learner, smallest, data = plain(seed)
+    assert (smallest > 0.0).all() and learner.schema.converged
+    assert learner.theta_started_ns is not None
+    assert 0.2e9 < learner.theta_started_ns < 3e9
     fresh = held_out(seed)
     ours = held_out_rms(learner, learner.theta.theta, fresh)
     theirs = held_out_rms(learner, batch_theta(learner, data), fresh)
@@ -96,19 +99,8 @@ def test_as_good_as_batch_least_squares(seed: int) -> None:
     assert (ours < 0.05 * rms(fresh.true[3])).all()
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_possible_body_at_every_step(seed: int) -> None:
-    _, smallest, _ = plain(seed)
-    assert (smallest > 0.0).all()
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_theta_waits_for_lambda(seed: int) -> None:
-    learner, _, _ = plain(seed)
-    assert learner.schema.converged
-    assert learner.theta_started_ns is not None
-    assert 0.2e9 < learner.theta_started_ns < 3e9
-    waiting = teach(learner_for(), states_of(plain(seed)[2])[:100], rows=1)
+def test_theta_waits_for_lambda() -> None:
+    waiting = teach(learner_for(), states_of(plain(1)[2])[:100], rows=1)
     assert waiting.theta_started_ns is None and waiting.theta.count == 0
     model = learned_model(collect(waiting), panda_model())
     assert not model.theta_identifiable.any() and np.isnan(model.theta_std).all()

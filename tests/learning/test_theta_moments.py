@@ -9,9 +9,8 @@ import torch
 from adapter.effects.by_joint import SMOOTHING_DQ, JointSignals
 from adapter.learning.settings import LearnerSettings, ThetaSettings
 from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Filtered, KnownArm, Theta
-from adapter.learning.theta_kernels import body_from_log_cholesky, forget_along, pull_back
+from adapter.learning.theta_kernels import forget_along
 from adapter.learning.tree_data import BodyMotion, TreeData
-from adapter.model.inertia import min_eigenvalue, pseudo_inertia
 from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.kernels import base_at_rest
@@ -29,29 +28,6 @@ PARENTS = ((-1, -1, 0, 0, 2, 1, 3), (-1, 0, 1, 1, -1, 4), (-1, 0, 1, 2, 3, 4, 5)
 GAIN = 3.0  # noise_gain
 TOOL = theta_from_log_cholesky(np.array([-0.5, -2, -2, -2, 0, 0, 0, 0.1, 0, 0.2]))
 LINK = theta_from_log_cholesky(np.array([0.2, -2, -2, -2, 0, 0, 0, 0.1, 0, 0]))
-
-
-def kernel_body(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    U, th = np.full((4, 4), np.nan), np.full(10, np.nan)
-    body_from_log_cholesky(x, U, th)
-    return U, th
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_log_cholesky_kernel_is_that_of_the_networks(seed: int) -> None:
-    """Bodies, all of them possible, and the way back: the transposed Jacobian."""
-    rng = np.random.default_rng(seed)
-    x, g = rng.normal(size=(2, 10))
-    U, th = kernel_body(x)
-    assert np.allclose(th, theta_from_log_cholesky(x), rtol=1e-13, atol=1e-14)
-    assert np.allclose(U @ U.T, pseudo_inertia(th), rtol=1e-13, atol=1e-13)
-    bodies = np.array([kernel_body(x)[1] for x in rng.normal(size=(200, 10))])
-    assert (min_eigenvalue(bodies) > 0.0).all()
-    found = np.full(10, np.nan)
-    pull_back(U, g, found)
-    t = torch.from_numpy(x)
-    jacobian = torch.autograd.functional.jacobian(theta_from_log_cholesky_torch, t).numpy()
-    assert np.allclose(found, jacobian.T @ g, rtol=1e-11, atol=1e-12)
 
 
 @dataclass

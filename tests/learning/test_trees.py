@@ -82,6 +82,8 @@ def test_a_fixed_tree_with_friction_and_fewer_updates() -> None:
     model, data = on_a_table(4)
     friction = np.array([0.3, 0.2, 0.4])
     data = replace(data, tau=data.tau + friction * data.dq)
+    with pytest.raises(SettingsError, match="gravity"):
+        OnlineLearner(model.tree)
     settings = LearnerSettings(effects=("viscous_friction",), update_every=2)
     learner = OnlineLearner(model.tree, model.gravity, settings)
     for state in states_of(data)[:3500]:
@@ -91,11 +93,6 @@ def test_a_fixed_tree_with_friction_and_fewer_updates() -> None:
     error = learner.predict(states_of(rest)) - rest.tau
     assert np.sqrt((error**2).mean()) < 0.02 * np.sqrt((rest.tau**2).mean())
     assert np.allclose(learner.theta.effect_values[0], friction, atol=0.03)
-
-
-def test_a_base_at_rest_needs_gravity() -> None:
-    with pytest.raises(SettingsError, match="gravity"):
-        OnlineLearner(on_a_table(4)[0].tree)
 
 
 def test_what_is_not_finite_is_refused_and_counted() -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pybullet
 import pytest
 
 from adapter.effects.robots import robot_urdf, to_urdf
@@ -101,7 +100,7 @@ def skeleton(text: str) -> str:
 
 
 def same_arm(text: str, model: SelfModel) -> None:
-    """The arm in a URDF is the model's: frames and torques, by our reader and by Pinocchio."""
+    """The arm in a URDF is the model's: frames and torques, by our reader."""
     back, rng = read_quietly(text, model.tree.floating), np.random.default_rng(1)
     moved = rng.uniform(-1.5, 1.5, (3, 20, model.tree.n))
     assert back.tree.joint_names == model.tree.joint_names
@@ -267,23 +266,3 @@ def test_a_model_without_its_file_is_compared_by_its_joints() -> None:
     assert "compared by its joints alone" in written.notes[0]
     same_arm(written.text, model)
     assert robot_urdf(model).onto is None and robot_urdf(model).text == to_urdf(model)
-
-
-@pytest.mark.parametrize("alone", [False, True])
-def test_pybullet_finds_no_kilogram_that_is_not_there(alone: bool, tmp_path: Path) -> None:
-    model = read_quietly(DRESSED)
-    path = tmp_path / "arm.urdf"
-    path.write_text(re.sub("<visual.*?</visual>", "", robot_urdf(model, alone=alone).text))
-    client = pybullet.connect(pybullet.DIRECT)
-    try:
-        body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
-        count = pybullet.getNumJoints(body, physicsClientId=client)
-        weights = [
-            pybullet.getDynamicsInfo(body, k, physicsClientId=client)[0] for k in range(-1, count)
-        ]
-    finally:
-        pybullet.disconnect(client)
-    # the foot is a link of its own below the world, and the fixed base itself in the arm alone
-    assert sum(weights) == pytest.approx(
-        model.theta[:, 0].sum() + (0.0 if alone else 5.0), abs=1e-6
-    )

@@ -1,7 +1,4 @@
-"""Rotations and trees hold what they promise, for any input; inertial parameters against Pinocchio.
-
-And against the definition of the pseudo-inertia.
-"""
+"""Rotations and trees hold what they promise, for any input; bodies are Pinocchio's."""
 
 from __future__ import annotations
 
@@ -152,44 +149,24 @@ def test_trees_name_their_faults() -> None:
 RNG = np.random.default_rng(3)
 
 
-def cloud(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """Point masses: masses (k,) and places (k, 3)."""
-    return RNG.uniform(0.1, 1.0, points), RNG.normal(size=(points, 3)) * 0.2
+def body(oracle: pin.Inertia | pin.LogCholeskyParameters) -> np.ndarray:
+    return oracle.toDynamicParameters()[PIN_ORDER]
 
 
-def theta_of_cloud(mass: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """θ from its definition: sums over point masses."""
-    square = np.einsum("k,ki,kj->ij", mass, place, place)
-    i = np.trace(square) * np.eye(3) - square
-    six = [i[0, 0], i[0, 1], i[0, 2], i[1, 1], i[1, 2], i[2, 2]]
-    return np.array([mass.sum(), *(mass @ place), *six])
-
-
-def test_pseudo_inertia_is_the_sum_over_points() -> None:
-    mass, place = cloud()
-    lifted = np.hstack([place, np.ones((len(place), 1))])
-    expected = np.einsum("k,ki,kj->ij", mass, lifted, lifted)
-    theta = theta_of_cloud(mass, place)
-    np.testing.assert_allclose(pseudo_inertia(theta), expected, rtol=1e-12)
-    np.testing.assert_allclose(theta_from_pseudo_inertia(expected), theta, rtol=1e-12)
-
-
-def test_moving_a_body_moves_its_points() -> None:
-    mass, place = cloud()
-    rotation, position = exp_rotation(RNG.normal(size=3)), RNG.normal(size=3)
-    moved = theta_of_cloud(mass, place @ rotation.T + position)
-    found = move_theta(theta_of_cloud(mass, place), rotation, position)
-    np.testing.assert_allclose(found, moved, rtol=1e-11)
+def test_moving_a_body_is_pinocchios() -> None:
+    oracle, place = pin.Inertia.Random(), pin.SE3.Random()
+    found = move_theta(body(oracle), place.rotation, place.translation)
+    np.testing.assert_allclose(found, body(place.act(oracle)), rtol=1e-11, atol=1e-12)
 
 
 def test_parameters_are_pinocchios() -> None:
     for _ in range(10):
         oracle = pin.Inertia.Random()
         theta = theta_from_body(oracle.mass, oracle.lever, oracle.inertia)
-        np.testing.assert_allclose(theta, oracle.toDynamicParameters()[PIN_ORDER], rtol=1e-12)
-        np.testing.assert_allclose(
-            pseudo_inertia(theta), oracle.toPseudoInertia().toMatrix(), atol=1e-12
-        )
+        np.testing.assert_allclose(theta, body(oracle), rtol=1e-12)
+        pseudo = oracle.toPseudoInertia().toMatrix()
+        np.testing.assert_allclose(pseudo_inertia(theta), pseudo, atol=1e-12)
+        np.testing.assert_allclose(theta_from_pseudo_inertia(pseudo), theta, atol=1e-12)
         mass, com, tensor = body_from_theta(theta)
         np.testing.assert_allclose(mass, oracle.mass)
         np.testing.assert_allclose(com, oracle.lever, atol=1e-12)
@@ -200,8 +177,7 @@ def test_log_cholesky_is_pinocchios() -> None:
     """The same ten numbers in the same order as Rucker and Wensing's, as Pinocchio has them."""
     for _ in range(10):
         vector = RNG.normal(size=10) * 0.7
-        oracle = pin.LogCholeskyParameters(vector)
-        theirs = oracle.toDynamicParameters()[PIN_ORDER]
+        theirs = body(pin.LogCholeskyParameters(vector))
         np.testing.assert_allclose(theta_from_log_cholesky(vector), theirs, rtol=1e-12)
 
 

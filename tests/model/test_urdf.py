@@ -83,13 +83,6 @@ def test_fixed_links_are_merged() -> None:
     np.testing.assert_allclose(hand.position, [0, 0, 0.107])
 
 
-def test_humanoids() -> None:
-    atlas = documented(shared("models/atlas_v5.urdf"), floating=True)
-    assert (atlas.tree.n, atlas.tree.bodies, atlas.tree.rows) == (30, 31, 36)
-    assert atlas.theta[:, 0].sum() == pytest.approx(174.05, abs=0.01)
-    assert documented(shared("models/talos_reduced.urdf")).tree.n == 32
-
-
 def test_pybullets_panda_has_its_fingers_locked() -> None:
     data = pytest.importorskip("pybullet_data")
     path = Path(data.getDataPath()) / "franka_panda" / "panda.urdf"

@@ -146,48 +146,6 @@ def test_compiled_torques_and_regressors_are_the_networks(randoms: list[Random])
         assert (joints[:, others] == 0.0).all()
 
 
-def test_one_sample_is_one_row_of_the_table() -> None:
-    r = Random(3, floating=True)
-    motion, tau, Y = np.empty((r.tree.n, 12)), np.empty(r.tree.rows), np.empty(r.Y.shape[1:])
-    for m in range(len(r.tau)):
-        joints = JointMotion(*(x[m] for x in r.joints))
-        kernels.link_motion(r.frames, joints, r.base[m], motion)
-        kernels.inverse_dynamics(r.frames, r.theta, joints.q, motion, r.base[m], tau)
-        kernels.regressor(r.frames, joints.q, motion, r.base[m], Y)
-        assert relative(motion, r.motion[m]) < 1e-9
-        assert relative(tau, r.tau[m]) < 1e-9
-        assert relative(Y, r.Y[m]) < 1e-9
-
-
-def test_compiled_wrench_of_a_body_is_the_networks() -> None:
-    rng = np.random.default_rng(0)
-    rows, theta = rng.normal(size=(20, 12)), rng.normal(size=10)
-    parts = FrameMotion(*torch.from_numpy(rows).split(3, dim=1))
-    expected = networks.body_wrench_regressor(parts).numpy()
-    for row, theirs in zip(rows, expected, strict=True):
-        W, wrench = np.full((6, 10), np.nan), np.full(6, np.nan)
-        kernels.body_wrench_regressor(row, W)
-        kernels.body_wrench(row, theta, wrench)
-        assert relative(W, theirs) < 1e-13
-        assert relative(wrench, theirs @ theta) < 1e-13
-
-
-def test_compiled_transfer_of_wrenches_is_the_networks() -> None:
-    """Link by link (eq. 14a), and to the base at once."""
-    rng = np.random.default_rng(1)
-    lam, q, W = rng.normal(size=(3, 6)), rng.normal(size=3), rng.normal(size=(6, 4))
-    chain = frames_of(Tree((-1, 0, 1)), lam)
-    R, o, out = np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((6, 4))
-    kernels.place_frames(chain, q, R, o)
-    kernels.transfer_wrench(R[2], o[2], W, out)
-    expected = torch.from_numpy(W)[None]
-    for j in (2, 1, 0):
-        expected = networks.to_parent(
-            expected, torch.from_numpy(q[j : j + 1]), torch.from_numpy(lam[j])
-        )
-    assert relative(out, expected[0]) < 1e-13
-
-
 def fixed_case(name: str) -> tuple[Case, SelfModel, list[np.ndarray]]:
     text = random_urdf(8, seed=3) if name == "two_arms" else urdf_text(name)
     case = pinocchio_case(text, floating=False, samples=8, seed=4)

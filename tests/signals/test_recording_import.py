@@ -11,7 +11,7 @@ from adapter.cli.exit_codes import ExitCode
 from adapter.signals.importer import velocity_doubts
 from drivers.files.mcap import McapWriter, read_log
 from drivers.files.mcap.records import McapScan
-from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros1_mcap, write_ros2
+from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros2
 from tests.helpers.mcap_tools import record, samples
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -28,10 +28,7 @@ def packed(path):
 
 MAKERS = {
     "folder": lambda path: write_ros2(path, STATES),
-    "one file": lambda path: next(write_ros2(path, STATES).glob("*.db3")),
-    "ros1.bag": lambda path: write_ros1(path, STATES, compression="LZ4"),
     "ros1 without a suffix": lambda path: write_ros1(path, STATES, compression="BZ2"),
-    "ros1.mcap": lambda path: write_ros1_mcap(path, STATES),
     "packed.db3.gz": packed,
 }
 

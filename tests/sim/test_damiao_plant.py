@@ -195,31 +195,6 @@ def test_rotor_warms_as_an_exponential_of_its_load() -> None:
         assert motor.status == 0xC  # 146 K of rise are too much
 
 
-CYCLE_US = {  # typical, least, most of the reference page's table, 7 commands and 7 replies
-    True: (713, 678, 781),
-    False: (1668, 1554, 1890),
-}
-
-
-@pytest.mark.parametrize("fd", [True, False])
-def test_a_cycle_of_fourteen_frames_takes_what_the_reference_says(fd) -> None:
-    """Torque-only commands and replies of an arm at random places."""
-    rng, cycles = np.random.default_rng(8), []
-    typical, least, most = CYCLE_US[fd]
-    for _ in range(300):
-        total = 0
-        for motor in IDS:
-            scale = PANDA[motor - 1]
-            data = mit(scale, tau=rng.uniform(-0.4, 0.4) * scale[2])
-            reply = bytes([0x10 | motor, *rng.integers(0, 256, 5).tolist(), 30, 33])
-            for message in (frame(motor, data, fd), frame(motor + 16, reply, fd)):
-                total += frame_ns(message)
-        cycles.append(total / 1000)
-    assert least <= min(cycles)
-    assert max(cycles) <= most
-    assert np.mean(cycles) == pytest.approx(typical, rel=0.01)
-
-
 def test_replies_queue_behind_commands_up_to_the_end_of_the_cycle() -> None:
     with rig() as bench:
         bench.enable()

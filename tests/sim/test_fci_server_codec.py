@@ -5,8 +5,6 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sim.fci.codec import (
     COMMAND_BYTES,
@@ -135,18 +133,6 @@ def test_what_is_no_request_is_refused(version, wrong):
     number, size = wrong
     with pytest.raises(BadRequest):
         RequestReader(version).feed(struct.pack("<III", number, 0, size))
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.binary(max_size=600), st.sampled_from([5, 10]))
-def test_random_bytes_are_refused_or_read(data, version):
-    try:
-        for request in RequestReader(version).feed(data):
-            assert request.name in NAMES[version]
-    except BadRequest:
-        pass
-    command = read_command(data, version)
-    assert (command is None) == (len(data) != COMMAND_BYTES[version])
 
 
 def test_replies_have_their_published_bytes():

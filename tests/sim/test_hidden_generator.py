@@ -17,7 +17,7 @@ from adapter.model.urdf import read_urdf
 from drivers.files.mcap import Commands, read_log
 from tests.benchmarks.gap_trials import run_trial
 from tests.helpers import gap_mujoco
-from tests.helpers.gap_effects import predict, rnea, sense, slope
+from tests.helpers.gap_effects import predict, sense, slope
 from tests.helpers.gap_oracle import Oracle, detectability, rms, second, slow, torque_judge
 from tests.helpers.gap_scorer import score_trial, summary, table
 from tests.helpers.gap_tools import pinocchio_recording, with_sines
@@ -193,18 +193,6 @@ def test_both_simulators_make_the_same_log(seed):
     np.testing.assert_allclose(theirs.q, ours.q, atol=0.05)
     off = np.sqrt(np.square(theirs.tau - ours.tau).mean(axis=0))
     assert (off < 0.25 * np.abs(ours.tau).max(axis=0) + 0.3).all()
-
-
-def test_a_load_pulls_at_the_hand():
-    """The torque that the load adds is what its mass at its centre weighs, at rest."""
-    twin = draw_twin(11)
-    q, still = twin.q[:1], np.zeros((1, 7))
-    bare = twin.arm.theta.copy()
-    bare[-1] -= np.r_[twin.load_kg, twin.load_kg * twin.load_at, np.zeros(6)]
-    more = rnea(twin.arm, q, still, still)
-    more -= rnea(twin.arm.with_changes(theta=bare), q, still, still)
-    arms = np.abs(more).max() / (9.81 * twin.load_kg)
-    assert 0.1 < arms < 1.0  # m: what a load in the hand hangs on, in a ready posture
 
 
 def test_bristles_hold_and_slide():

@@ -134,43 +134,20 @@ def plant_of(truth, **options):
     return Plant(truth, noise=levels_of("none"), **options)
 
 
-@pytest.fixture(scope="module")
-def moved():
+def test_signals_of_a_sample_are_of_one_instant():
+    """The torque is the rigid body's, without a lag, and velocity the rate of the position."""
     plant = plant_of(panda())
-    signals, _ = drive(plant)
+    (q, dq, tau), _ = drive(plant)
     assert plant.fault is None and not plant.saturated
-    return signals
-
-
-def moving(x):
-    """Without the start, where the torque has a corner."""
-    return x[50:]
-
-
-def test_rigid_dynamics_hold_between_the_signals_of_a_sample(moved):
-    q, dq, tau = moved
-    model, _ = rigid_torque(panda(), q, dq)
-    left = moving(model - tau[1:-1])
-    assert np.all(rms(left) < 1e-4 * rms(tau - tau.mean(0)))
-
-
-def test_torque_and_acceleration_have_no_lag_between_them(moved):
-    q, dq, tau = moved
-    model, _ = rigid_torque(panda(), q, dq)
-    slope = np.gradient(tau, T_S, axis=0)[1:-1]
-    model, slope, tau = moving(model), moving(slope), moving(tau[1:-1])
-    lag_s = np.sum(slope * (tau - model), axis=0) / np.sum(slope**2, axis=0)
-    assert np.all(np.abs(lag_s) < 5e-6)
-
-
-def test_velocity_is_the_derivative_of_position_at_the_same_instant(moved):
-    q, dq, _ = moved
+    moving = slice(50, None)  # without the start, where the torque has a corner
+    left = tau[1:-1] - rigid_torque(panda(), q, dq)[0]
+    assert np.all(rms(left[moving]) < 1e-4 * rms(tau - tau.mean(0)))
+    slope = np.gradient(tau, T_S, axis=0)[1:-1][moving]
+    assert np.all(np.abs(np.sum(slope * left[moving], axis=0)) < 5e-6 * np.sum(slope**2, axis=0))
     # Fourth-order difference: the truncation of the plain one is of the size looked for.
-    slope = (8 * (q[3:-1] - q[1:-3]) - (q[4:] - q[:-4])) / (12 * T_S)
-    ddq = np.gradient(dq, T_S, axis=0)[2:-2]
-    left, ddq = moving(slope - dq[2:-2]), moving(ddq)
-    skew_s = np.sum(left * ddq, axis=0) / np.sum(ddq**2, axis=0)
-    assert np.all(np.abs(skew_s) < 1e-6)
+    rate = (8 * (q[3:-1] - q[1:-3]) - (q[4:] - q[:-4])) / (12 * T_S)
+    left, ddq = (rate - dq[2:-2])[moving], np.gradient(dq, T_S, axis=0)[2:-2][moving]
+    assert np.all(np.abs(np.sum(left * ddq, axis=0)) < 1e-6 * np.sum(ddq**2, axis=0))
 
 
 def test_own_acceleration_is_that_of_the_oracle():
@@ -276,21 +253,13 @@ def test_leaving_the_range_of_a_joint_brakes_for_good():
     assert np.abs(sample.dq).max() < 1e-6
 
 
-def test_driver_says_what_it_cannot_do():
+def test_driver_says_what_it_is_and_does_not_open_again():
     arm = SimulatedArm(plant_of(panda()))
-    with pytest.raises(DriverError, match="connect"):
-        arm.read()
     arm.connect()
     assert arm.joint_names[0] == "panda_joint1" and arm.link_names[6] == "panda_link7"
     assert [arm.read().stamp_ns for _ in range(3)] == [0, 1_000_000, 2_000_000]
     assert arm.plant_time_ns > 0
-    for bad in (np.zeros(6), np.full(7, np.nan)):
-        with pytest.raises(DriverError, match="7 finite torques"):
-            arm.command(bad)
     arm.close()
-    arm.close()
-    with pytest.raises(DriverError, match="closed"):
-        arm.read()
     with pytest.raises(DriverError, match="closed"):
         arm.connect()
 
