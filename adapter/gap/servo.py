@@ -319,14 +319,14 @@ def _named(arm: _Arm, fits: list[JointFit], progress: Callable[[str], None]) -> 
         fits = [fit_joint(t, f.freedom, f.x) for t, f in zip(tasks, fits, strict=True)]
     # what one explained on long steps, and under noisy loads, may be explained by now
     fits = _with_lead(arm, [_needed(fit, fit.freedom.free) for fit in fits])
-    fits = _with_one_delay(arm, fits)
+    drawn = arm.drawn_loads(_motions(arm, fits))
+    fits = _with_one_delay(arm, fits, drawn)
     tasks = arm.tasks(_motions(arm, fits))
     fits = [
         replace(fit_joint(t, f.freedom, f.x), delay_std=f.delay_std)
         for t, f in zip(tasks, fits, strict=True)
     ]
     progress("weighing what is not as documented")
-    drawn = arm.drawn_loads(_motions(arm, fits))
     return [_weighed(arm, fit, drawn) for fit in fits]
 
 
@@ -345,13 +345,15 @@ def _with_lead(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     return list(fits) if told or found else without
 
 
-def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
+def _with_one_delay(
+    arm: _Arm, fits: Sequence[JointFit], drawn: Sequence[Sequence[Sequence[Load]]]
+) -> list[JointFit]:
     """One bus brings all commands: the delay that all joints together show, or the documented.
 
     Inertias that are off move it in all joints at once.
     """
     delays = np.array([fit.x[DELAY] for fit in fits])
-    drawn, noise, moved = arm.drawn_loads(_motions(arm, fits)), [], []
+    noise, moved = [], []
     for fit in fits:
         at, j = int(fit.freedom.free[:DELAY].sum()), fit.task.joint
         noise.append(fit.scale[at] ** 2 * fit.noise_covariance[at, at])

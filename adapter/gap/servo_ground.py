@@ -43,10 +43,11 @@ TIP_M = 0.01  # around a documented tip: a finger is twice as wide
 # starts: the point; share of time that it touches; one standard deviation of its height from there
 BEYOND_M, LOWEST, HEIGHT_M = (0.0, 0.05, 0.1), (0.02, 0.2), 0.1
 STIFF, YIELDS = 1e3, 5.0  # N/m, table and arm together; a factor of its root, one std deviation
-ROUGH, FINE = 6, 30  # steps of a fit from each start, and of the best
+ROUGH, FINE, FINALISTS = 6, 30, 2  # steps of a fit from each start, and of how many of the best
 # what the ground explains beside the servos, on unseen blocks, of a joint that it holds: where a
 # real arm touches a table, shares of 0.68 to 0.9 on two or three joints; else on one at most
 PAYS_CHI2, PAYS_SHARE = 25.0, 0.5
+SETTLED = 1e-4  # of the cost: friction's kinks make the way down to it long
 PLAIN = DELAY + 1  # numbers of each servo that are fitted along with it
 LEAST_JOINTS = 2  # that it holds: one alone may have a servo of another kind
 
@@ -185,7 +186,7 @@ def robust_fit(
                 z, rows, cost, damping = trial, moved, after, damping / 5.0
                 break
             damping *= 5.0
-        if before - cost < 1e-3 * before:  # settled
+        if before - cost < SETTLED * before:
             break
     return z, cost
 
@@ -211,7 +212,7 @@ def find_ground(
         tasks: of all joints, without ground; x: (n, 11) servos fitted without.
         tips: documented, beyond which there is nothing: where there are some, nothing else touches.
     """
-    best, least = None, np.inf
+    found: list[tuple[float, _Together, Array, Array]] = []
     # a recording in which the hand is held spoils the servos; each alone is another start
     starts = [x]
     count = len(tasks[0].tracks)
@@ -234,17 +235,18 @@ def find_ground(
             y, servos = np.array([*point, *rest]) / SIZE, x
             for _ in range(2):  # a joint that got stuck starts again, beside the ground as it is
                 y, servos, cost = one.fit(y, one.best_of(y, [servos, *starts]), ROUGH)
-                if cost < least:
-                    best, least = (one, y, servos), cost
-    assert best is not None
-    one, y, servos = best
-    beside = one.under(one.ground(y))
-    fits = [
-        np.array([fit_joint(t, ALL_FREE, own).x for t, own in zip(beside, each, strict=True)])
-        for each in (servos, *starts)
-    ]
-    both = [one.fit(y, each, FINE) for each in (servos, one.best_of(y, fits))]
-    y, servos, _ = min(both, key=lambda fit: fit[2])
+            found.append((cost, one, y, servos))
+    fine = []
+    for _, one, y, servos in sorted(found, key=lambda x: x[0])[:FINALISTS]:
+        y, servos, _ = one.fit(y, servos, FINE)
+        beside = one.under(one.ground(y))
+        fits = [
+            np.array([fit_joint(t, ALL_FREE, own).x for t, own in zip(beside, each, strict=True)])
+            for each in (servos, *starts)
+        ]
+        y, servos, cost = one.fit(y, one.best_of(y, fits), FINE)
+        fine.append((cost, one, y, servos))
+    _, one, y, servos = min(fine, key=lambda x: x[0])
     pairs = zip(one.under(one.ground(y)), servos, strict=True)
     gain, left = np.zeros((2, arm.n))
     unit = np.array([chi2_unit(task, own) for task, own in pairs])

@@ -42,6 +42,7 @@ class Track:
     gained: Array
     smooth: Array
     _alone: dict[int, Track] = field(default_factory=dict, init=False, repr=False)
+    _goals: dict[float, list[Array]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, log: Log, longest_step_s: float = LONGEST_STEP_S) -> Track:
@@ -86,11 +87,22 @@ class Track:
         """(k,) readings that are judged."""
         return self.stamp_s >= EDGE_S
 
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.intp], Array]:
+        """(k,) steps in which the readings are, and (k, 1) how far, of one."""
+        at = np.clip((self.stamp_s / self.step_s).astype(int), 0, len(self.t) - 1)
+        return at, np.clip(self.stamp_s / self.step_s - at, 0.0, 1.0)[:, None]
+
     def goal(self, lead: Array, delay_s: float) -> Array:
         """(2, m, n) rad: command, and lead (n,) s times its rate, over each step."""
-        ends, tables = np.concatenate([[0.0], self.t]) - delay_s, (self.held, lead * self.gained)
-        both = [np.diff(columns(ends, self.at_s, x), axis=0) for x in tables]
-        return np.ascontiguousarray(np.array(both) / self.step_s)
+        if delay_s not in self._goals:
+            if len(self._goals) > 2:  # a fit needs its delay, and two nearby for slopes
+                self._goals.clear()
+            ends = np.concatenate([[0.0], self.t]) - delay_s
+            both = (np.diff(columns(ends, self.at_s, x), axis=0) for x in (self.held, self.gained))
+            self._goals[delay_s] = [x / self.step_s for x in both]
+        held, gained = self._goals[delay_s]
+        return np.array([held, lead * gained])
 
     def commanded(self, delay_s: float) -> Array:
         """(m, n) rad: commands at the ends of the steps, between two of them by a line."""
@@ -99,9 +111,8 @@ class Track:
 
     def left(self, q: Array) -> Array:
         """(k, n) rad: readings less simulated positions (m, n) at the ends of the steps."""
-        whole = np.concatenate([self.start[:1], q])
-        grid = np.concatenate([[0.0], self.t])
-        return np.asarray(self.q - columns(self.stamp_s, grid, whole))
+        whole, (at, share) = np.concatenate([self.start[:1], q]), self._places
+        return np.asarray(self.q - whole[at] - share * (whole[at + 1] - whole[at]))
 
     def simulated(self, q: Array) -> Array:
         """(3, m + 1, n) as `smooth`, of simulated positions (m, n)."""
