@@ -23,6 +23,7 @@ from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found, from_the_start
 from adapter.judgement.noise import LEAST_NM
+from adapter.model.posterior import Label, Posterior, root_of
 from adapter.model.spatial import Array
 from adapter.screening.readings import rms
 
@@ -82,6 +83,42 @@ def _doubts(fit: Fit, known: Carried | Moments) -> tuple[Fit, Array]:
     return free, honest_covariance(free, free.carried())
 
 
+def posterior_of(fit: Fit, known: Carried | Moments) -> Posterior:
+    """What is known of a fit's inertias and of its effects' numbers together.
+
+    What lies on a grid, and whole inertias of bodies, have standard deviations of their own alone.
+    Where a weak spring rests is no Gaussian's; what it adds at zero is, and counts to the offset.
+    """
+    fit, covariance = _doubts(fit, known)
+    size = fit.dtheta.size
+    labels, least, rows = [], [], [*np.eye(size, len(covariance))]
+    at_zero: dict[Label, Array] = {}
+    for k, named in enumerate(fit.named):
+        effect, values = named.candidate.effect, named.values
+        on_grid = {p.key for p in effect.parameters if p.grid_share}
+        own, place = np.zeros((_flat(values).size, len(covariance))), 0
+        own[:, place_of(fit, k)] = _slopes(_flat, fit, k).T
+        for key, value in values.items():
+            if np.ndim(value) == 0 and key not in on_grid:
+                joint = next(iter(_joints(named)), 0)
+                labels.append((effect.in_files or effect.name, joint, key))
+                least.append(0.0 if key in effect.positive else -np.inf)
+                rows.append(own[place])
+            place += np.size(value)
+        if effect is SPRING:  # k (q - q0), told with q0 as it is
+            slopes = _slopes(lambda x: np.array([x["k"], x["k"] * x["q0"]]), fit, k)
+            offset = OFFSET.name, labels[-1][1], "o"
+            at_zero[offset] = np.zeros(len(covariance))
+            at_zero[offset][place_of(fit, k)] = slopes @ [values["q0"], -1.0]
+            rows[-1] = 0.0 * rows[-1]
+    for k, label in enumerate(labels):
+        rows[size + k] = rows[size + k] + at_zero.get(label, 0.0)
+    way = np.array(rows)
+    root = root_of(way @ covariance @ way.T, len(way))
+    frames = np.zeros((fit.n, 6, 6))
+    return Posterior(tuple(labels), np.array(least), root, np.zeros_like(fit.dtheta), frames)
+
+
 def _curve(fit: Fit, covariance: Array, k: int) -> dict[str, Any] | None:
     """A law's torque over the range of its signal that was seen, and its standard deviation."""
     named, law = fit.named[k], fit.named[k].candidate.effect
@@ -114,16 +151,17 @@ def _std_of(
     of_values: Callable[[dict[str, Any]], Array], fit: Fit, covariance: Array, k: int
 ) -> Array:
     """Standard deviations (p,) of what hangs on the parameters of the k-th named effect."""
-    named, own = fit.named[k], place_of(fit, k)
+    own, slopes = place_of(fit, k), _slopes(of_values, fit, k)
+    return np.sqrt(np.einsum("ip,ij,jp->p", slopes, covariance[np.ix_(own, own)], slopes))
+
+
+def _slopes(of_values: Callable[[dict[str, Any]], Array], fit: Fit, k: int) -> Array:
+    """(c, p) of what hangs on the parameters of the k-th named effect, by its coefficients."""
+    named = fit.named[k]
     decode, steps = named.candidate.template.decode, 1e-4 * named.candidate.prior_std  # of a prior
     at = of_values(named.values)
-    slopes = np.array(
-        [
-            (of_values(decode(named.x + step * unit)) - at) / step
-            for step, unit in zip(steps, np.eye(len(named.x)), strict=True)
-        ]
-    )
-    return np.sqrt(np.einsum("ip,ij,jp->p", slopes, covariance[np.ix_(own, own)], slopes))
+    pairs = zip(steps, np.eye(len(named.x)), strict=True)
+    return np.array([(of_values(decode(named.x + d * unit)) - at) / d for d, unit in pairs])
 
 
 def _flat(values: dict[str, Any]) -> Array:

@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter1d
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
 from adapter.gap.evidence import Carried, Moments, Normal
-from adapter.gap.findings import entries, noise_floor
+from adapter.gap.findings import entries, noise_floor, posterior_of
 from adapter.gap.fit import Fit, Model, place_of, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.long_recording import LongRecording
@@ -45,7 +45,9 @@ def model_of(
     """The self model with the corrections and the named effects of a fit; see `entries`."""
     theta = model.theta.copy()
     theta[len(theta) - len(fit.dtheta) :] += fit.dtheta  # a floating base comes before the links
-    return replace(model, theta=theta, effects=(*model.effects, *entries(fit, recording, known)))
+    effects = (*model.effects, *entries(fit, recording, known))
+    posterior = None if known is None else posterior_of(fit, known)
+    return replace(model, theta=theta, effects=effects, posterior=posterior)
 
 
 def held_out_models(

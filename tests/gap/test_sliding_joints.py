@@ -70,6 +70,14 @@ def test_friction_of_a_slide_is_found_in_newtons_and_exported(tmp_path: Path) ->
     assert result.after.torque_rmse_nm[2] < 0.2 * result.before.torque_rmse_nm[2]
     learned = adapter.load_model(tmp_path / "model.json")
     assert learned.tree.slides == (False, False, True, False)
+    samples, rows = learned.sample(300), slice(None, None, 200)
+    at = [x["effect"] for x in learned.effects].index(dry.effect)
+    drawn = [x.effects[at]["parameters"]["Fc"] for x in samples]
+    assert np.std(drawn) == pytest.approx(dry.std["Fc"], rel=0.2)
+    q, dq = log.q[rows], log.dq[rows]
+    torques = [adapter.inverse_dynamics(x, q, dq, 0.0 * q) for x in samples[:40]]
+    # what trades against one another in the data does so in the draws
+    assert (np.std(torques, axis=0).mean(axis=0) < [0.01, 0.01, 1.0, 0.01]).all()
     urdf = ET.parse(adapter.export(learned, tmp_path / "arm.urdf")).getroot()
     joint = next(x for x in urdf.iter("joint") if x.get("name") == "j3")
     losses = joint.find("dynamics")
