@@ -149,8 +149,9 @@ class Player:
         return pace
 
     def seconds(self, limits: MotionLimits, settings: ExcitationSettings) -> float:
-        """Of motion time from the start on, after which it is over."""
-        return APPROACH_S + float(self.t[-1]) / self.pace(limits, settings) + settings.start_s
+        """Of motion time from the start on, after which it is over: whole tenths."""
+        lasts = APPROACH_S + float(self.t[-1]) / self.pace(limits, settings) + settings.start_s
+        return float(np.ceil(10.0 * lasts) / 10.0)
 
     @cached_property
     def _spline(self) -> BSpline:

@@ -27,7 +27,7 @@ HOW_READ = (
 ITS_OWN = (
     *("--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"),
     *("--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"),
-    *("--foxglove", "--fault", "--record", "--overwrite"),
+    *("--foxglove", "--fault", "--record", "--overwrite", "--motion"),
 )
 
 
