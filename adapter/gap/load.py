@@ -31,19 +31,8 @@ from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, 
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
+from adapter.screening import screen
 from adapter.screening.likelihood import Rows
-from adapter.screening.screen import (
-    MOVES_DQ,
-    SHORTEST_S,
-    Judged,
-    RecordingFault,
-    RecordingRefused,
-    cleaned,
-    judged,
-    of_this_robot,
-    silent,
-    smoothed_rows,
-)
 from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log
@@ -166,25 +155,25 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
     own, survey = log, None
     if is_long(log):
-        survey = Survey.of(of_this_robot(log, model))
+        survey = Survey.of(screen.of_this_robot(log, model))
         own = survey.busiest(log)
-    own, _, said = cleaned(own, model)
-    smoothed, torque = smoothed_rows(own), Judged()
-    moves = float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S >= 1.0  # s
+    own, _, said = screen.cleaned(own, model)
+    smoothed, torque = screen.smoothed_rows(own), screen.Judged()
+    moves = float((np.abs(smoothed[1]).max(axis=1) > screen.MOVES_DQ).sum()) * GRID_S >= 1.0  # s
     more = ["the arm hardly moves: static friction in its joints counts as load"]
     if moves:  # asked of the arm without what is fitted: a load of 90 kg explains N cm
-        dead = silent(own, model.tree.joint_names)
-        torque = judged(own, model, smoothed)
+        dead = screen.silent(own, model.tree.joint_names)
+        torque = screen.judged(own, model, smoothed)
         more = dead + torque.notes
     alive, notes = np.ptp(own.tau, axis=0) > 0.0, own.warnings + said + more
     own = torque.in_time(own if survey is None else survey.log)
     moments = _of_all(own, torque.mounted(model))
     left_s = float(moments.rows.sum()) * moments.period_s
     if left_s < 0.3:  # of rows
-        raise RecordingRefused(
-            RecordingFault.DATA,
+        raise screen.RecordingRefused(
+            screen.RecordingFault.DATA,
             f"{log.path}: its pauses leave {left_s:.2g} s to weigh by; record at least "
-            f"{SHORTEST_S:g} s without one.",
+            f"{screen.SHORTEST_S:g} s without one.",
         )
     return _Taken(moments, moves, alive, notes)
 
@@ -196,7 +185,7 @@ def _of_all(log: Log, model: SelfModel) -> Moments:
 
 def _moments(piece: Log, model: SelfModel, whole: Log) -> Moments:
     """What a piece of a recording tells."""
-    q, dq, ddq, tau = (x[EDGE:-EDGE:EVERY] for x in smoothed_rows(piece))
+    q, dq, ddq, tau = (x[EDGE:-EDGE:EVERY] for x in screen.smoothed_rows(piece))
     begin, end = (
         (stamp - whole.first_ns) / max(whole.end_ns - whole.first_ns, 1)
         for stamp in (piece.first_ns, piece.end_ns)

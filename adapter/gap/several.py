@@ -80,7 +80,9 @@ class Several:
             own = [fit.own_noise()[0] for fit in fits]
             level, memory = np.median([(x.level, x.memory) for x in own], axis=0)
             fits = [fit.with_noise([Noise(level, memory)]) for fit in fits]
-            parts = [Part.of(fit, _own(fit)) for fit in fits]
+            # a recording's own is all between the timing and the end of its load
+            places = [np.arange(f.dtheta.size + 1, place_of(f, 0)[-1] + 1) for f in fits]
+            parts = [Part.of(fit, place) for fit, place in zip(fits, places, strict=True)]
             together = Together(parts, parts[0].known.prior_std[parts[0].common])
             fits = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
             if first:
@@ -171,11 +173,6 @@ def _row(name: str, load: HandLoad) -> LogLoad:
     com = tuple(map(float, load.com)) if load.com_shown else None
     std = tuple(map(float, load.com_std)) if load.com_shown else None
     return LogLoad(name, load.is_there, load.mass, load.mass_std, com, std, load.frame)
-
-
-def _own(fit: Fit) -> np.ndarray:
-    """Places of what is a recording's own: all between the timing and the end of its load."""
-    return np.arange(fit.dtheta.size + 1, place_of(fit, 0)[-1] + 1)
 
 
 def _apart(nominal: Fit, i: int) -> Fit:

@@ -451,7 +451,14 @@ def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen | None:
 
     None where no size would be that an arm may have.
     """
-    rest = _beside(c, fit)
+    form, out = c.effect.form, []  # coefficients carried along: not those of its like on its joint
+    for k, e in enumerate(fit.named):
+        other = e.candidate
+        like = other.key == c.key or (form and other.effect.form == form)
+        if other.joint != c.joint or not like:
+            out.append(place_of(fit, k))
+    first = np.arange(len(fit.coefficients) - sum(len(e.x) for e in fit.named))
+    rest = np.concatenate([first, *out])
     G, _ = carried.part(rest).reduced(X @ X.T, X @ carried.N[rest].T, X @ carried.data)
     std, effect = c.prior_std, CATALOGUE[c.effect.name]
     ways = np.linalg.slogdet(np.eye(len(G)) + std[:, None] * G * std)[1]
@@ -472,15 +479,3 @@ def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen | None:
     if above:
         size = value((np.sqrt(asked) + SURELY) * np.sqrt(covariance[0]))
     return Unseen(effect.name, c.joint + 1, key, float(size), c.units[key], bool(above))
-
-
-def _beside(c: Candidate, fit: Fit) -> np.ndarray:
-    """Coefficients that are carried along with a candidate: not those of its like on its joint."""
-    form, out = c.effect.form, []
-    for k, e in enumerate(fit.named):
-        other = e.candidate
-        like = other.key == c.key or (form and other.effect.form == form)
-        if other.joint != c.joint or not like:
-            out.append(place_of(fit, k))
-    first = np.arange(len(fit.coefficients) - sum(len(e.x) for e in fit.named))
-    return np.concatenate([first, *out])

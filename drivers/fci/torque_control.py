@@ -83,19 +83,16 @@ class TorqueControl:
         if self.fault is not None:
             raise DriverError(self.fault)
         if self._phase == _IDLE:
-            self._begin(state.status.robot_mode)
+            if (mode := state.status.robot_mode) != tables.ROBOT_IDLE:
+                raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
+            payload = codec.move_payload(self._version)
+            self._move_id = self._channel.send(tables.MOVE[self._version], payload)
+            self._phase, self._accepted = _STARTING, False
+            self._deadline = time.monotonic() + START_LIMIT_S
+            self.limiter.reset()
+            self._answered, self._sent_id, self._rates = -SLOTS, -1, -RATE_WINDOW
         elif self._phase == _RUNNING:
             self._drive(tau.tolist(), accepted, message_id)
-
-    def _begin(self, robot_mode: int) -> None:
-        if robot_mode != tables.ROBOT_IDLE:
-            raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[robot_mode]}")
-        payload = codec.move_payload(self._version)
-        self._move_id = self._channel.send(tables.MOVE[self._version], payload)
-        self._phase, self._accepted = _STARTING, False
-        self._deadline = time.monotonic() + START_LIMIT_S
-        self.limiter.reset()
-        self._answered, self._sent_id, self._rates = -SLOTS, -1, -RATE_WINDOW
 
     def _drive(
         self, tau: list[float], accepted: Array, message_id: int, finished: bool = False

@@ -89,7 +89,14 @@ class _Joint:
         clean = self.sums
         if given is None:
             clean = moments.without_noise(j, 0.5 * self._left_over())
-        self._judge(clean, weights)
+        # directions that count as shown, and the spread inside them, in the parent's axes
+        values, vectors = frame_fit.curvature_in_parent(clean, weights, self.frame)
+        # Noise alone makes curvature of the size of the square root of the count (schema learner).
+        least = max(0.05**-2, 10.0 * np.sqrt(self.count))  # 0.05 rad or m: more is not shown
+        shown = values > max(least, frame_fit.RELATIVE_CURVATURE * float(values[-1]))
+        kept = vectors[:, shown]
+        self.shown = kept @ kept.T
+        self.std = np.sqrt(np.einsum("ak,k->a", kept**2, 1.0 / values[shown]))
         freedom = Freedom.of(np.eye(6)[None] - self.shown, self.frame.p[None])
         self.frame = frame_fit.nearest(self.sums, weights, self.frame, zero, freedom)
 
@@ -104,16 +111,6 @@ class _Joint:
         floor = 1e-14 * self.power / (3.0 * self.count)
         some = self.used & (self.power > 0.0)
         return np.where(some, 1.0 / np.where(some, np.maximum(variance, floor), 1.0), 0.0)
-
-    def _judge(self, clean: Array, weights: Array) -> None:
-        """Directions that count as shown, and the spread inside them, in the parent's axes."""
-        values, vectors = frame_fit.curvature_in_parent(clean, weights, self.frame)
-        # Noise alone makes curvature of the size of the square root of the count (schema learner).
-        least = max(0.05**-2, 10.0 * np.sqrt(self.count))  # 0.05 rad or m: more is not shown
-        shown = values > max(least, frame_fit.RELATIVE_CURVATURE * float(values[-1]))
-        kept = vectors[:, shown]
-        self.shown = kept @ kept.T
-        self.std = np.sqrt(np.einsum("ak,k->a", kept**2, 1.0 / values[shown]))
 
 
 # Which of the parent's signals stand in s, three numbers each; products of w_i come last in a's.
