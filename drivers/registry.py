@@ -24,7 +24,6 @@ HARDWARE = {
     "can": ".damiao.arm:DamiaoArm",
     "ros2": ".ros2.arm:Ros2Arm",
 }
-FRANKA_JOINTS = 7
 NAMELESS = ("can", "ros2")  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
 OWN = ".own:open_own"  # takes the same
@@ -92,7 +91,7 @@ def joint_count(address: str) -> int | None:
     """Number of joints of an arm that tells no names; None where nothing says it."""
     scheme, rest = split_address(address)
     if scheme == "fci":
-        return FRANKA_JOINTS
+        return 7
     told = dict(parse_qsl(urlsplit(rest).query)).get("joints", "")  # can: a number; ros2: names
     if scheme not in NAMELESS or not told:
         return None

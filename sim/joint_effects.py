@@ -27,7 +27,6 @@ from sim.truth import FLANGE, Array, Truth
 
 COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_WIDTH)
 NEWTON_ROUNDS = 8
-NEWTON_DONE = 1e-12  # rad/s
 
 # Kinds of rows, one for each effect on a motion: kind, joint, other joint, three parameters in the
 # order of `SPECS`, start and end.
@@ -165,7 +164,7 @@ def step(M: Array, bias: Array, v: Array, h: float, parts: Array, drive: Array) 
         gap = tau - explicit - bias - f - M @ dv / h
         change = np.linalg.solve(A, gap)
         dv += change
-        if np.abs(change).max() < NEWTON_DONE:
+        if np.abs(change).max() < 1e-12:  # rad/s
             break
     # f and tau belong to the dv before the last change; the slopes carry them over.
     return tau - explicit - f - (slope + tau_slope) * change - armature * dv / h

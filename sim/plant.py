@@ -148,7 +148,16 @@ class Plant:
             self._engine.tick(self._drive, end)
             self._drive = end
             self._q, self._dq = self._engine.state()
-            self._watch()
+            # brakes for good when a joint leaves its range or is too fast
+            limits, q, dq = self.truth.limits, self._q, self._dq
+            outside = (q < limits.lower) | (q > limits.upper)
+            wrong = outside | (np.abs(dq) > limits.velocity)
+            if self.fault is None and wrong.any():
+                j = int(np.argmax(wrong))
+                what = "left its range" if outside[j] else "exceeded its speed limit"
+                at = f"q {q[j]:.3f} rad, dq {dq[j]:.3f} rad/s"
+                self.fault = f"{self.joint_names[j]} {what} ({at})"
+                self.stop()
         if self._sensors is not None:
             now_s = self._k * PERIOD_S
             self._seen = self._sensors.read(now_s, self._q, self._dq, self._drive)
@@ -164,18 +173,6 @@ class Plant:
         slow = np.clip(-self._dq / BRAKE_TIME_S, -most, most)
         hold = LOCK_RATE**2 * (self._lock - self._q) - 2 * LOCK_RATE * self._dq
         return self._engine.drive_for(self._q, self._dq, np.where(self._moving, slow, hold))
-
-    def _watch(self) -> None:
-        """Brake for good when a joint leaves its range or is too fast."""
-        limits, q, dq = self.truth.limits, self._q, self._dq
-        outside = (q < limits.lower) | (q > limits.upper)
-        wrong = outside | (np.abs(dq) > limits.velocity)
-        if self.fault is None and wrong.any():
-            j = int(np.argmax(wrong))
-            what = "left its range" if outside[j] else "exceeded its speed limit"
-            at = f"q {q[j]:.3f} rad, dq {dq[j]:.3f} rad/s"
-            self.fault = f"{self.joint_names[j]} {what} ({at})"
-            self.stop()
 
     def clean(self) -> JointSample:
         """What the last `read` would have said without noise and with a perfect clock."""

@@ -26,7 +26,6 @@ _TORQUE_CHAIN = (
     *("x_torque_crosstalk", "x_torque_saturation", "torque_gain", "torque_offset"),
     "x_torque_deadband",
 )
-DIRECTION_WIDTH = 0.01  # rad/s, below it the motor pushes neither way in full
 RATES_HZ = (200.0, 500.0)  # readings a second, between these
 W_NOISE, A_NOISE = 1.75e-3, 0.04  # of a reading, rad/s and m/s² rms
 W_BIAS, A_BIAS = np.radians(0.5), 0.2  # at most, rad/s and m/s²
@@ -161,7 +160,7 @@ class Play:
         width = np.zeros(self._n)
         for effect, j in self._terms:
             width[j] += effect.number("b") * float(effect.acts(t))
-        way = np.clip(dq / DIRECTION_WIDTH, -1.0, 1.0)
+        way = np.clip(dq / 0.01, -1.0, 1.0)  # rad/s, below it the motor pushes neither way in full
         moved = np.clip(self.gap + way * width * period_s / CROSSING_S, -width / 2, width / 2)
         self.rate, self.gap = (moved - self.gap) / period_s, moved
 

@@ -24,8 +24,6 @@ from adapter.signals.recording import describe, summary
 from adapter.signals.source_signals import ImportSpec
 from drivers.files.mcap import Log, recover
 
-TABLES = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
-
 
 def run_import(args: argparse.Namespace) -> int:
     """Carry `import` out."""
@@ -104,7 +102,7 @@ def opened(args: argparse.Namespace) -> Log | None:
     path = args.file
     table = path.with_suffix("") if path.suffix == ".gz" else path
     more = {"period_s": args.period, "episode": args.episode}
-    if table.suffix in TABLES or is_data_set(path):
+    if table.suffix in (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet") or is_data_set(path):
         return table_log(ImportSpec.from_options([str(path)], args.columns, args.units, **more))
     if not (args.units or args.columns or any(x is not None for x in more.values())):
         return None

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 
 from adapter.cli.common import robot_of_log, told_of
-from adapter.gap.load import find_load
-from adapter.gap.load_words import as_json, robot_lines, sentence
+from adapter.gap.load import as_json, find_load, robot_lines, sentence
 from adapter.gap.torque_gains import as_told
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json

@@ -22,8 +22,7 @@ from adapter.runs.outcome import learned_model
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import DISAGREEMENT, console, labelled, results_folder, say, show, warn
 from adapter.screening.screen import check_torque
-from adapter.signals.base_motion import with_base_motion
-from adapter.signals.link_imus import with_link_imus
+from adapter.signals.frame_topics import with_base_motion, with_link_imus
 from adapter.signals.matching import matching, present
 from drivers.files.mcap import Log, read_log
 

@@ -24,8 +24,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.control.feedforward import ModelFeedforward, not_learned
-from adapter.control.instant import Row, beside, wind_table
+from adapter.control.feedforward import ModelFeedforward, Row, beside, not_learned, wind_table
 from adapter.effects.active import with_bodies
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array

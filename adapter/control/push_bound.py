@@ -14,7 +14,6 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import frames_of, place_frames
 
 POSES, DIRECTIONS = 40, 200  # that are looked at
-LOOKED_S = 30.0  # of path
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # spreads directions evenly over a sphere
 # Of the effort limit, and N m: what a stopped arm may still push with on each joint. A CAN arm is
 # carried with a tenth of it beyond its weight (`resting`); half of that for what it sags by.
@@ -66,7 +65,7 @@ def push_bound(
     z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
     angle, radius, forces = GOLDEN_ANGLE * np.arange(DIRECTIONS), np.sqrt(1.0 - z**2), []
     ways = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-    for s in np.linspace(0.0, LOOKED_S, POSES):
+    for s in np.linspace(0.0, 30.0, POSES):  # of path
         place_frames(frames, motion.path(s)[0], R, o)
         felt, j = np.zeros((n, len(ways))), n - 1
         while j >= 0:

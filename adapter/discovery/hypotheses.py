@@ -39,7 +39,6 @@ FREE_RATIO = 4.0  # a link goes free where all explain it worse than by so many 
 RARE_PRIOR = -5.0
 MOST_FITTED = 48  # hypotheses of a link whose frame is fitted; with more of them nothing is decided
 MOST_MOUNTED = 24  # pairs of a link that are fitted; with more of them nothing is decided
-MOST_KEPT = 200  # options of a link
 LOST = 18.0  # log odds below the best at which a hypothesis is dropped
 Fits = dict[tuple[int, int], dict[str, float]]  # misfits by channel of (joint column, parent)
 Pair = tuple[int, int, int]  # joint, and two bodies of which the first is a link and moves
@@ -193,7 +192,7 @@ def ranked(
     """
     if link == scores.bodies.base:
         return (Option(link, NO_JOINT, FREE, 0.0),)
-    best = sorted(found, key=lambda o: -o.score)[:MOST_KEPT]
+    best = sorted(found, key=lambda o: -o.score)[:200]  # options of a link
     free = Option(link, NO_JOINT, FREE, scores.free_score() + prior)
     return tuple(sorted([*best, free], key=lambda o: (-o.score, o.parent == FREE)))
 

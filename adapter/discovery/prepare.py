@@ -92,7 +92,15 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> PreparedLog:
     channels = channels_of(log, first)
     even = _resampled(log, 1e-9 * (stamps - stamps[0]).astype(np.float64), first, channels)
     through = ZeroPhase(even.rate_hz, cutoff_hz)
-    keep = _kept(log, even.heard, through)
+    # thinned out, without the ends and what was not heard
+    keep = np.zeros(len(even.heard), dtype=bool)
+    keep[through.edge : len(even.heard) - through.edge : through.step] = True
+    keep &= even.heard
+    if keep.sum() < 4 * KEPT_PER_CUTOFF:
+        raise SettingsError(
+            f"{log.path}: {int(keep.sum())} samples are left after filtering at "
+            f"{through.cutoff_hz:.0f} Hz; it is too short or has too many gaps"
+        )
     q, dq, ddq, joint_noise = _joint_signals(even.joints, through)
     noise = {k: _noise(x) * through.passes for k, x in channels.values.items()}
     motion = {k: through(x) for k, x in even.motion.items()}
@@ -330,19 +338,6 @@ class ZeroPhase:
     def rate_of(self, smooth: Array) -> Array:
         """d/dt of what was filtered at full rate."""
         return np.asarray(np.gradient(smooth, 1.0 / self.rate_hz, axis=0))
-
-
-def _kept(log: Log, heard: np.ndarray, through: ZeroPhase) -> np.ndarray:
-    """Samples (m,) bool that are used: thinned out, without the ends and what was not heard."""
-    keep = np.zeros(len(heard), dtype=bool)
-    keep[through.edge : len(heard) - through.edge : through.step] = True
-    keep &= heard
-    if keep.sum() < 4 * KEPT_PER_CUTOFF:
-        raise SettingsError(
-            f"{log.path}: {int(keep.sum())} samples are left after filtering at "
-            f"{through.cutoff_hz:.0f} Hz; it is too short or has too many gaps"
-        )
-    return keep
 
 
 def _joint_signals(

@@ -28,7 +28,6 @@ NEVER = -1e12  # score of what is not possible
 MOST_SPLITS = 2000  # of the search for the tree; more ambiguity than that is left undecided
 MOST_RIVAL_SPLITS = 30  # of the search for a rival, which else counts with its bound
 TIED = 0.01  # log odds between roots that decide nothing
-MOST_RIVALS = 30  # options of one link that are tried one by one
 
 Key = tuple[int, int, int]
 Ranked = list[tuple[Option, float]]
@@ -169,7 +168,7 @@ class TreeSearch:
             own = structure.chosen[link]
             scores = {own: structure.score}
             near = [o for o in options if others + o.score >= structure.score - LOST]
-            for option in near[:MOST_RIVALS]:
+            for option in near[:30]:  # options of one link that are tried one by one
                 if option != own:
                     _, scores[option] = search._search(option, MOST_RIVAL_SPLITS)
             top = max(scores.values())

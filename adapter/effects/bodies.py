@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import base as base
+from adapter.effects.base import Array, Motion, Values
 from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import ALONE, BARE, LEVELLED, LOADS, WEIGHED, Length, Phrase
 from adapter.model.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
@@ -41,32 +42,30 @@ class Payload(base.BodyEffect):
     watched = True
     is_theta = True
 
-    def decode(self, x: base.Array) -> dict[str, Any]:
+    def decode(self, x: Array) -> dict[str, Any]:
         """Of ten inertial parameters."""
         return parameters_of(x)
 
-    def body(
-        self, theta: base.Array, gravity: base.Array, joint: int, values: base.Values
-    ) -> tuple[base.Array, base.Array]:
+    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """The last link with the body."""
         changed = theta.copy()
         changed[-1] += theta_of(values)
         return changed, gravity
 
-    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """A body of its own where it can be one."""
         alone = more.carry(theta_of(values))
         return None if alone else "it has no inertia that could be a body's; the last link has it"
 
 
-def theta_of(values: base.Values) -> base.Array:
+def theta_of(values: Values) -> Array:
     """Ten parameters (10,) of a payload about the link's origin."""
     com = np.array([values["cx"], values["cy"], values["cz"]], dtype=float)
     tensor = tensor_from_six(np.asarray(values.get("inertia", np.zeros(6)), dtype=float))
     return np.asarray(theta_from_body(float(values["m"]), com, tensor))
 
 
-def parameters_of(theta: base.Array) -> dict[str, Any]:
+def parameters_of(theta: Array) -> dict[str, Any]:
     """Payload parameters of ten inertial ones (10,)."""
     m, com, tensor = body_from_theta(theta)
     keys = dict(zip(("cx", "cy", "cz"), map(float, com), strict=True))
@@ -87,19 +86,17 @@ class LinkInertia(base.BodyEffect):
     steady = True  # what a link gains while it moves is a load
     is_theta = True
 
-    def decode(self, x: base.Array) -> dict[str, Any]:
+    def decode(self, x: Array) -> dict[str, Any]:
         """Of ten inertial parameters."""
         return {"dtheta": [float(value) for value in x]}
 
-    def body(
-        self, theta: base.Array, gravity: base.Array, joint: int, values: base.Values
-    ) -> tuple[base.Array, base.Array]:
+    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """Link `joint` with its change."""
         changed = theta.copy()
         changed[joint] += np.asarray(values["dtheta"], dtype=float)
         return changed, gravity
 
-    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Part of the link."""
         more.dtheta[joint] += np.asarray(values["dtheta"], dtype=float)
         return None
@@ -122,18 +119,16 @@ class BaseTilt(base.BodyEffect):
     )
     shows = ((LOADS, "grows with the load"), (LEVELLED, "shows"))
 
-    def body(
-        self, theta: base.Array, gravity: base.Array, joint: int, values: base.Values
-    ) -> tuple[base.Array, base.Array]:
+    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """Gravity seen from the tilted base."""
         return theta, np.asarray(self.turn(values).T @ gravity)
 
     @staticmethod
-    def turn(values: base.Values) -> base.Array:
+    def turn(values: Values) -> Array:
         """Orientation (3, 3) of the base against one that stands as the model says."""
         return exp_rotation([float(values["rx"]), float(values["ry"]), 0.0])
 
-    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """A base that stands on an upright link."""
         if more.floating:
             return NO_PLACE
@@ -166,14 +161,12 @@ class ExternalWrench(base.TorqueEffect):
     passing = True
     watched = True
 
-    def torque(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """-J^T w."""
         wrench = np.array([values[key] for key in KEYS], dtype=float)
         return -motion.arm.wrench_torque(motion.q, wrench)
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The wrench."""
         sums.wrench += np.array([values[key] for key in KEYS], dtype=float)
         return True

@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 
 from adapter.effects import base
+from adapter.effects.base import Array, JointSignals, Motion, Values
 from adapter.effects.by_joint import WAYS_RAD, shares_of_ways
 from adapter.effects.phrases import SPEEDS, STILL, TURNS, Phrase
 from adapter.model.urdf_text import FRICTION, Additions
@@ -38,7 +39,7 @@ def bend(steps, s0, z, bent):
             bent[i, j] = z[j]
 
 
-def bending(q: base.Array, s0: float) -> base.Array:
+def bending(q: Array, s0: float) -> Array:
     """z (m,) of bristles along the way of a joint q (m,), rad, that starts at zero."""
     steps = np.diff(q, prepend=q[:1])
     z = np.empty((len(q), 1))
@@ -50,20 +51,18 @@ class Rubs(base.JointTorque):
     """Friction that may wind up over a small way s0 before the joint slides."""
 
     @abstractmethod
-    def level(self, dq: base.Array, values: base.Values) -> base.Array:
+    def level(self, dq: Array, values: Values) -> Array:
         """N m of a joint that slides at dq, rad/s."""
 
-    def bristles(self, values: base.Values) -> float | None:
+    def bristles(self, values: Values) -> float | None:
         """s0, where it has one."""
         return float(values["s0"]) if "s0" in values else None
 
-    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """The level in motion, as dry friction."""
         return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
-    def torque(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The level times z, which is zero before the motion; of rows apart as if each slid."""
         dq, s0 = motion.dq[:, joint], self.bristles(values)
         at_once = motion.apart or s0 is None
@@ -98,19 +97,19 @@ class BristleFriction(base.LearnedEffect, Rubs):
         """The level, at several ways; at once it is Coulomb friction."""
         return tuple(map(_template, WAYS_RAD[1:]))
 
-    def reshaped(self, values: base.Values, ratio: float) -> tuple[base.Template, ...]:
+    def reshaped(self, values: Values, ratio: float) -> tuple[base.Template, ...]:
         """Another s0."""
         return (_template(WAY.nearest(ratio * float(values["s0"]))),)
 
-    def log_odds_of(self, values: base.Values) -> float:
+    def log_odds_of(self, values: Values) -> float:
         """Friction that slides at once looks like bristles over a way that no joint has."""
         return log_odds_of_way(float(values["s0"]))
 
-    def level(self, dq: base.Array, values: base.Values) -> base.Array:
+    def level(self, dq: Array, values: Values) -> Array:
         """Fc."""
         return np.full_like(dq, values["Fc"])
 
-    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""
         return np.asarray(values["Fc"] * self.torque_per_unit(at, values["s0"]))
 
@@ -120,11 +119,11 @@ class BristleFriction(base.LearnedEffect, Rubs):
             return "coulomb_friction", {"Fc": value}
         return super().learned_as(value, shape)
 
-    def basis(self, at: base.JointSignals) -> tuple[base.Array, ...]:
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
         """z of each of the ways."""
         return tuple(at.bent)
 
-    def shares(self, shape: base.Array) -> base.Array:
+    def shares(self, shape: Array) -> Array:
         """Those of the ways around s0."""
         return shares_of_ways(shape)
 
@@ -160,27 +159,27 @@ class StribeckFriction(Rubs):
         """Both levels at several velocity scales, without bristles and with."""
         return tuple(_falling(vs, s0) for s0 in (None, USUAL_RAD) for vs in VELOCITIES)
 
-    def reshaped(self, values: base.Values, ratio: float) -> tuple[base.Template, ...]:
+    def reshaped(self, values: Values, ratio: float) -> tuple[base.Template, ...]:
         """Another vs, another s0."""
         vs, s0 = float(values["vs"]), self.bristles(values)
         other = _falling(SCALE.nearest(ratio * vs), s0)
         return (other,) if s0 is None else (other, _falling(vs, WAY.nearest(ratio * s0)))
 
-    def log_odds_of(self, values: base.Values) -> float:
+    def log_odds_of(self, values: Values) -> float:
         """As of bristles."""
         s0 = self.bristles(values)
         return 0.0 if s0 is None else log_odds_of_way(s0)
 
-    def possible(self, values: base.Values) -> bool:
+    def possible(self, values: Values) -> bool:
         """Friction that falls with speed, all of it positive."""
         return 0.0 < float(values["Fc"]) < float(values["Fs"])
 
-    def level(self, dq: base.Array, values: base.Values) -> base.Array:
+    def level(self, dq: Array, values: Values) -> Array:
         """The Stribeck curve."""
         level, rest, vs = (values[key] for key in ("Fc", "Fs", "vs"))
         return np.asarray(level + (rest - level) * np.exp(-((dq / vs) ** 2)))
 
-    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """The curve times z, where there is a way over which bristles are known to be bent."""
         z, s0 = at.direction, values.get("s0", WAY.lower)
         if np.max(s0) > WAYS_RAD[0]:

@@ -7,18 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeGuard
 
+from adapter.effects import joint_torques
 from adapter.effects.base import Effect, LearnedEffect
 from adapter.effects.bodies import BaseTilt, ExternalWrench, LinkInertia, Payload
 from adapter.effects.bristle_friction import BristleFriction, StribeckFriction
 from adapter.effects.encoders import Backlash, EncoderOffset, EncoderRipple, JointElasticity
-from adapter.effects.friction import (
-    AsymmetricFriction,
-    CoulombFriction,
-    FrictionDrift,
-    LoadDependentFriction,
-    ViscousFriction,
-)
-from adapter.effects.joint_torques import JointSpring, MotorInertia, TorqueRipple
 from adapter.effects.law import CURVES, LAWS
 from adapter.effects.sensors import SignalDelay, TorqueFilter, TorqueGain, TorqueOffset
 from adapter.errors import SettingsError
@@ -27,17 +20,17 @@ from drivers.errors import choices
 CATALOGUE: dict[str, Effect] = {
     effect.name: effect
     for effect in (
-        ViscousFriction(),
-        CoulombFriction(),
-        AsymmetricFriction(),
+        joint_torques.ViscousFriction(),
+        joint_torques.CoulombFriction(),
+        joint_torques.AsymmetricFriction(),
         StribeckFriction(),
         BristleFriction(),
-        LoadDependentFriction(),
-        MotorInertia(),
+        joint_torques.LoadDependentFriction(),
+        joint_torques.MotorInertia(),
         JointElasticity(),
         Backlash(),
-        TorqueRipple(),
-        JointSpring(),
+        joint_torques.TorqueRipple(),
+        joint_torques.JointSpring(),
         TorqueOffset(),
         TorqueGain(),
         TorqueFilter(),
@@ -48,7 +41,7 @@ CATALOGUE: dict[str, Effect] = {
         LinkInertia(),
         BaseTilt(),
         ExternalWrench(),
-        FrictionDrift(),
+        joint_torques.FrictionDrift(),
     )
 }
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import base as base
+from adapter.effects.base import Array, Motion, Values
 from adapter.effects.by_joint import ByJoint, smooth_sign
 from adapter.effects.phrases import FLANK, LOADS, TURN, Phrase
 from adapter.model.urdf_text import Additions
@@ -23,19 +24,17 @@ class EncoderOffset(base.MotionEffect):
     phrase = Phrase.reads("o", "encoder")
     shows = ((LOADS, "grows with the load"),)
 
-    def link_side(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Motion:
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - o."""
         still = np.zeros(len(motion.t))
         return motion.moved(joint, still - float(values["o"]), still, still)
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The offset."""
         sums.offset[joint] += float(values["o"])
         return True
 
-    def export(self, more: Additions, joint: int, values: base.Values) -> str | None:
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """The zero of the joint."""
         more.offset[joint] += values["o"]
         return None
@@ -56,20 +55,18 @@ class EncoderRipple(base.MotionEffect):
     phrase = Phrase("the encoder of {who} errs by {a} once per turn")
     shows = ((LOADS, "grows with the load"), (TURN, "changes sign along the turn"))
 
-    def decode(self, x: base.Array) -> dict[str, Any]:
+    def decode(self, x: Array) -> dict[str, Any]:
         """Of sine and cosine."""
         return dict(zip(("a", "phase"), base.polar(x), strict=True))
 
-    def link_side(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Motion:
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - a sin(q + phase) with its two derivatives (to first order in a)."""
         a, angle = float(values["a"]), motion.q[:, joint] + float(values["phase"])
         dq, ddq = motion.dq[:, joint], motion.ddq[:, joint]
         sine, cosine = a * np.sin(angle), a * np.cos(angle)
         return motion.moved(joint, -sine, -cosine * dq, sine * dq**2 - cosine * ddq)
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The wave."""
         sums.wave[joint] += float(values["a"]) * np.exp(1j * float(values["phase"]))
         return True
@@ -91,19 +88,17 @@ class JointElasticity(base.MotionEffect):
     phrase = Phrase("{who} {is} elastic, with a stiffness of {k}")
     shows = ((LOADS, "grows with the square of the load"),)
 
-    def decode(self, x: base.Array) -> dict[str, Any]:
+    def decode(self, x: Array) -> dict[str, Any]:
         """Of 1/k, which is zero where the gear is rigid."""
         return {"k": 1.0 / float(x[0]) if x[0] else math.inf}
 
-    def link_side(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Motion:
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - tau/k with two derivatives: fourth ones of q, nothing but noise above a band."""
         twist = -motion.inside_band(tau[:, joint], joint) / float(values["k"])
         speed = motion.rate(twist)
         return motion.moved(joint, twist, speed, motion.rate(speed))
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The compliance."""
         sums.compliance[joint] += 1.0 / float(values["k"])
         return True
@@ -147,9 +142,7 @@ class Backlash(base.MotionEffect):
             base.Template((b,), self.decode, f"b = {1e3 * b:g} mrad", chord=True) for b in SIZES_RAD
         )
 
-    def link_side(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Motion:
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """The play operator driven by q: the link is pushed by one flank, then by the other.
 
         Before the first instant the motor pushed the way it moves first, at rows apart the way it
@@ -168,11 +161,11 @@ class Backlash(base.MotionEffect):
         rate = motion.rate(behind)
         return motion.moved(joint, behind, rate, motion.rate(rate))
 
-    def log_odds_of(self, values: base.Values) -> float:
+    def log_odds_of(self, values: Values) -> float:
         """What starts and stops leave of the noise in accelerations looks like a narrow play."""
         return NARROW if abs(float(values["b"])) < SIZES_RAD[0] else 0.0
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """Half the play."""
         sums.half_play[joint] += 0.5 * float(values["b"])
         return True

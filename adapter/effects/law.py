@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import base as base
+from adapter.effects.base import Array, JointSignals, Motion, Values
 from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
 
 LAW = "law: "  # begins the name of a law that has no other
@@ -86,7 +87,7 @@ class Expression:
 
     text: str
     powers: Mapping[str, int]
-    term: Callable[[base.JointSignals, base.Array], base.Array]
+    term: Callable[[JointSignals, Array], Array]
     setting: Setting | None = None
     drags: bool = False
 
@@ -99,19 +100,19 @@ class Expression:
         return _unit(total)
 
 
-def _above(at: base.JointSignals, a: base.Array) -> base.Array:
+def _above(at: JointSignals, a: Array) -> Array:
     return np.maximum(at.q - a, 0.0)
 
 
-def _below(at: base.JointSignals, a: base.Array) -> base.Array:
+def _below(at: JointSignals, a: Array) -> Array:
     return np.maximum(a - at.q, 0.0)
 
 
-def _deadband(at: base.JointSignals, a: base.Array) -> base.Array:
+def _deadband(at: JointSignals, a: Array) -> Array:
     return np.asarray(np.sign(at.tau) * np.maximum(np.abs(at.tau) - a, 0.0))
 
 
-def _power(at: base.JointSignals, p: base.Array) -> base.Array:
+def _power(at: JointSignals, p: Array) -> Array:
     return np.asarray(np.sign(at.dq) * np.abs(at.dq) ** p)
 
 
@@ -147,7 +148,7 @@ def _grammar() -> tuple[Expression, ...]:
 
 
 def _over_angle(
-    text: str, powers: Mapping[str, int], friction: Callable[[base.JointSignals], base.Array]
+    text: str, powers: Mapping[str, int], friction: Callable[[JointSignals], Array]
 ) -> tuple[Expression, ...]:
     """Friction that depends on the angle."""
     once, twice = {**powers, "q": 1}, {**powers, "q": 2}
@@ -175,13 +176,13 @@ class OverSignals(base.JointTorque):
         """The signal over which it is a curve; of what is a kind of friction, not its speed."""
         return next(iter(self.variables - {"dq"}), "dq")
 
-    def curve(self, x: base.Array, values: base.Values) -> base.Array:
+    def curve(self, x: Array, values: Values) -> Array:
         """Torque (k,) over that signal; of what is a kind of friction, at 1 rad/s."""
         q, dq, ddq, tau = (x if key == self.along else np.ones_like(x) for key in SIGNALS)
-        return self.on_signals(base.JointSignals(q, dq, ddq, tau), values)
+        return self.on_signals(JointSignals(q, dq, ddq, tau), values)
 
     @abstractmethod
-    def on_signals(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def on_signals(self, at: JointSignals, values: Values) -> Array:
         """Torque by signals of the joint that it follows."""
 
 
@@ -227,13 +228,13 @@ class Law(OverSignals):
         if not (setting and setting.wave):
             return base.Template((1.0,), lambda x: {"c": float(x[0]), **fixed}, label)
 
-        def decode(x: base.Array) -> dict[str, Any]:
+        def decode(x: Array) -> dict[str, Any]:
             size, phase = base.polar(x)
             return {"c": size, **fixed, "phase": phase}
 
         return base.Template((1.0, 1.0), decode, label)
 
-    def around(self, values: base.Values, std: float) -> base.Template | None:
+    def around(self, values: Values, std: float) -> base.Template | None:
         """Its coefficient, and by how much its setting is not as in `values`; None without one.
 
         `std`: of the coefficient.
@@ -248,7 +249,7 @@ class Law(OverSignals):
             linear=False,
         )
 
-    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """c times the expression of signals (..., n) of all joints, or of one that has its own."""
         if self.by:
             k = slice(self.by - 1, self.by)
@@ -256,21 +257,17 @@ class Law(OverSignals):
             at = at._replace(q=at.q[..., k], dq=at.dq[..., k], ddq=at.ddq[..., k], tau=tau)
         return self.on_signals(at, values)
 
-    def on(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def on(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """Torque (m,) of one joint, by its own signals or another's."""
         k = self.by - 1 if self.by else joint
-        at = base.JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
+        at = JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
         return self.on_signals(at, values)
 
-    def torque(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The law on one joint."""
         return base.on_joint(motion, joint, self.on(motion, tau, joint, values))
 
-    def on_signals(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def on_signals(self, at: JointSignals, values: Values) -> Array:
         setting = self.expression.setting
         term = self.expression.term(at, np.asarray(values[setting.key] if setting else 0.0))
         if setting and setting.wave:
@@ -283,7 +280,7 @@ class LearnedLaw(base.LearnedEffect, Law):
 
     prior_std, step = 10.0, 1.0  # of powers of some tenths of a rad/s
 
-    def basis(self, at: base.JointSignals) -> tuple[base.Array, ...]:
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
         """The expression."""
         return (np.asarray(self.expression.term(at, np.zeros(1))),)
 
@@ -296,16 +293,14 @@ def _laws_of(expression: Expression) -> list[Law]:
 
 
 PIECES, DEGREE = 5, 3  # of a spline over a signal's range
-WEIGHTS: dict[str, Callable[[base.JointSignals], base.Array | float]] = {
+WEIGHTS: dict[str, Callable[[JointSignals], Array | float]] = {
     "": lambda at: 1.0,
     "sign(dq) ": lambda at: at.direction,
     "dq ": lambda at: at.dq,
 }
 
 
-def splines(
-    x: base.Array, low: base.Array | float, high: base.Array | float, pieces: int = PIECES
-) -> base.Array:
+def splines(x: Array, low: Array | float, high: Array | float, pieces: int = PIECES) -> Array:
     """Cubic B-splines (pieces + DEGREE, ...) over a range; beyond it they stay as at its end."""
     step = np.maximum(np.subtract(high, low), 1e-9) / pieces
     at = np.clip((x - low) / step, 0.0, pieces) + DEGREE
@@ -351,11 +346,11 @@ class Curve(OverSignals):
         """Over a usual range."""
         return (self.between(-1.0, 1.0),)
 
-    def law(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """By each joint's own signals."""
         return self.on_signals(at, values)
 
-    def on_signals(self, at: base.JointSignals, values: base.Values) -> base.Array:
+    def on_signals(self, at: JointSignals, values: Values) -> Array:
         """Splines times coefficients, (..., n) of all joints or of one."""
         basis = splines(getattr(at, self.signal), values["low"], values["high"])
         x = np.moveaxis(np.asarray(values["x"], dtype=float), -1, 0)

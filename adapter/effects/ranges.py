@@ -39,7 +39,11 @@ def ranges(model: SelfModel) -> dict[str, Any]:
     doubt, table = model.doubt(), _Table(model)
     if not doubt.root.size:
         raise ModelError(f"{model.name} has no standard deviations; learn it with run or replay")
-    motion = _motion(model)
+    rng, n = np.random.default_rng(0), model.tree.n
+    low = np.where(np.isfinite(model.limits.lower), model.limits.lower, -WHOLE_TURN)
+    high = np.where(np.isfinite(model.limits.upper), model.limits.upper, WHOLE_TURN)
+    q = rng.uniform(low, high, (INSTANTS, n))
+    motion = q, SPEED * rng.normal(size=q.shape), ACCELERATION * rng.normal(size=q.shape)
     numbers, torques = [], []
     for column in SMALL * doubt.root.T:
         ends = model.with_numbers(doubt.mean + column), model.with_numbers(doubt.mean - column)
@@ -98,12 +102,3 @@ class _Table:
         """Of each number by its name; of a joint that slides m stands for rad, N for N m."""
         own = {f"{e} {key}": KNOWN[e].units()[key] for e, _, key in self._labels}
         return {**{key: unit for key, (unit, _) in PARTS.items()}, **own}
-
-
-def _motion(model: SelfModel) -> tuple[Array, Array, Array]:
-    """q, dq, ddq (m, n) at random inside of the limits."""
-    rng, n = np.random.default_rng(0), model.tree.n
-    low = np.where(np.isfinite(model.limits.lower), model.limits.lower, -WHOLE_TURN)
-    high = np.where(np.isfinite(model.limits.upper), model.limits.upper, WHOLE_TURN)
-    q = rng.uniform(low, high, (INSTANTS, n))
-    return q, SPEED * rng.normal(size=q.shape), ACCELERATION * rng.normal(size=q.shape)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import base as base
+from adapter.effects.base import Array, Motion, Values
 from adapter.effects.by_joint import ByJoint, JointSignals
 from adapter.effects.phrases import KNOWN_WEIGHT, LOADS, SPEEDS, STILL, SWINGS, Phrase
 
@@ -32,7 +33,7 @@ class TorqueOffset(base.LinearEffect):
     watched = True
     bundled = True
 
-    def column(self, at: JointSignals) -> base.Array:
+    def column(self, at: JointSignals) -> Array:
         """One."""
         return np.ones_like(at.dq)
 
@@ -51,19 +52,17 @@ class TorqueGain(base.SensorEffect):
     shows = ((LOADS, "grows with the load"), (KNOWN_WEIGHT, "misreads it in proportion"))
     watched = True
 
-    def columns(self, at: JointSignals) -> tuple[base.Array, ...]:
+    def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """The torque itself."""
         return (at.tau,)
 
-    def measured(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(1 + g) tau on the joint."""
         out = tau.copy()
         out[:, joint] *= 1.0 + float(values["g"])
         return out
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The gain."""
         sums.log_gain[joint] += np.log1p(float(values["g"]))
         return True
@@ -96,13 +95,11 @@ class SignalDelay(base.SensorEffect):
     )
     shows = LATENESS
 
-    def possible(self, values: base.Values) -> bool:
+    def possible(self, values: Values) -> bool:
         """Late, by a dozen milliseconds at most; what asks for more is something else."""
         return 0.0 < float(values["d"]) < LATEST_S
 
-    def measured(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """tau(t - d): whole samples later, and by its rate what is less."""
         d = float(values["d"])
         step = 0.0 if motion.apart else float(np.median(np.diff(motion.t)))
@@ -117,7 +114,7 @@ class SignalDelay(base.SensorEffect):
         out[:, joint] = late[:, joint]
         return np.asarray(out)
 
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: base.Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The delay."""
         sums.delay_s[joint] += float(values["d"])
         return True
@@ -150,29 +147,27 @@ class TorqueFilter(base.LearnedEffect, base.SensorEffect):
     def templates(self) -> tuple[base.Template, ...]:
         """Of a motor's or a sensor's electronics; and a slow one of one time constant."""
 
-        def of_first_order(x: base.Array) -> dict[str, Any]:
+        def of_first_order(x: Array) -> dict[str, Any]:
             return {"d": float(x[0]), "c": float(x[0]) ** 2}
 
         slow = base.Template((SLOW_S,), of_first_order, "of first order", chord=True)
         return (*super().templates(), slow)
 
-    def possible(self, values: base.Values) -> bool:
+    def possible(self, values: Values) -> bool:
         """Smoother, and not much earlier."""
         return -MOST_AHEAD_S < float(values["d"]) < MOST_S and super().possible(values)
 
-    def log_odds_of(self, values: base.Values) -> float:
+    def log_odds_of(self, values: Values) -> float:
         """Smoother than any sensor that is no later makes it, noise of the motion looks like it."""
         most = max(float(values["d"]) + MOST_AHEAD_S, 0.0) ** 2 + LEAST_C_S2
         return AFTERWARDS if float(values["c"]) > most else 0.0
 
-    def low_pass(self, values: base.Values) -> tuple[float, float]:
+    def low_pass(self, values: Values) -> tuple[float, float]:
         """The one whose series begins so; where there is none (see `measured`), the nearest."""
         d = max(float(values["d"]), 0.0)
         return d, min(max(d * d - float(values["c"]), 0.0), d * d)
 
-    def measured(
-        self, motion: base.Motion, tau: base.Array, joint: int, values: base.Values
-    ) -> base.Array:
+    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The low-pass of tau, on the joint or all of them; by the series what none of them is.
 
         Fourth derivatives of q are nothing but noise above a band; noise in there would make any
@@ -187,6 +182,6 @@ class TorqueFilter(base.LearnedEffect, base.SensorEffect):
             out[:, j] = motion.lagged(own, d, b) + more * bend - early * motion.rate(own)
         return np.asarray(out)
 
-    def basis(self, at: JointSignals) -> tuple[base.Array, ...]:
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
         """The second rate of the model's torque."""
         return (at.rates[self.rate],)

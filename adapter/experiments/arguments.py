@@ -42,24 +42,18 @@ def _check_experiment(args: argparse.Namespace) -> None:
     if args.seed < 0 or args.seeds < 0:
         raise UsageError("--seed and --seeds must be 0 or more")
     if "atlas" in args.names:
-        _check_falls(args.trajectories, args.seconds)
+        split, count, seconds = import_module(SPLIT), args.trajectories, args.seconds
+        if count < split.LEAST_TRAJECTORIES:
+            raise UsageError(f"--trajectories must be at least {split.LEAST_TRAJECTORIES}")
+        if not 0.0 < seconds < math.inf:
+            raise UsageError(f"--seconds must be above 0 and finite, got {seconds}")
+        learned = split.learned_samples(count, round(1000.0 * seconds))
+        if learned < LEAST_LEARNED:  # too little to learn from
+            raise UsageError(
+                f"{count} falls of {seconds:g} s give {learned} samples to learn from (1 % of the "
+                f"training set), fewer than {LEAST_LEARNED}; raise --trajectories or --seconds"
+            )
     check_writable(args.json)
-
-
-def _check_falls(trajectories: int, seconds: float) -> None:
-    """Raises UsageError where there would be too little to learn from."""
-    split = import_module(SPLIT)
-    if trajectories < split.LEAST_TRAJECTORIES:
-        raise UsageError(f"--trajectories must be at least {split.LEAST_TRAJECTORIES}")
-    if not 0.0 < seconds < math.inf:
-        raise UsageError(f"--seconds must be above 0 and finite, got {seconds}")
-    learned = split.learned_samples(trajectories, round(1000.0 * seconds))
-    if learned < LEAST_LEARNED:
-        raise UsageError(
-            f"{trajectories} falls of {seconds:g} s give {learned} samples to learn "
-            f"from (1 % of the training set), fewer than {LEAST_LEARNED}; raise --trajectories "
-            "or --seconds"
-        )
 
 
 def bench(parser: argparse.ArgumentParser) -> None:

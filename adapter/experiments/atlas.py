@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -208,7 +208,13 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     noise = noisy_trial(source, noisy_parts, truth.lam)
     learners = [by_networks.learned, by_moments.learned]
     if not args.no_baselines:
-        learners += _baselines(args, source, parts, say)
+        # on the right arm alone
+        joints = [tree.joint_names[j] for j in ARM]
+        carrier = tree.link_names[tree.parent[ARM[0]]]
+        index = sub_chain(tree, joints, carrier)
+        arm = Columns(len(index)), sub_parents(tree, index), source.truth.lam[index]
+        sets = arm_tables(source, parts, joints, carrier)
+        learners += compare(sets, contenders(*arm, args.full, args.seed), args.seed, say)
     say("learning online, sample by sample")
     used = [k for k in range(count) if k not in parts.control][:3]  # 30 s in all
     motions = [noisy(source.exact(k), k) for k in used]
@@ -251,19 +257,6 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         stated=atlas_stated(numbers),
         numbers=numbers,
     )
-
-
-def _baselines(
-    args: argparse.Namespace, source: Falls, parts: Split, say: Callable[[str], None]
-) -> list[LearnerScores]:
-    """The other learners, on the right arm alone."""
-    tree = source.tree
-    joints = [tree.joint_names[j] for j in ARM]
-    carrier = tree.link_names[tree.parent[ARM[0]]]
-    index = sub_chain(tree, joints, carrier)
-    arm = Columns(len(index)), sub_parents(tree, index), source.truth.lam[index]
-    sets = arm_tables(source, parts, joints, carrier)
-    return compare(sets, contenders(*arm, args.full, args.seed), args.seed, say)
 
 
 # --- every number of the experiment under a key of its own --------------------------------------

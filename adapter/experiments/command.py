@@ -54,23 +54,17 @@ def run(args: argparse.Namespace) -> int:
         else:
             panda = run_panda(args.seed, 40.0, args.seeds)  # the paper's λ needs as long
             print_stated("Panda, section IV.B", panda.stated)
-        _write(args, folder, atlas, panda)
+        figures = {
+            name: {**results.numbers, "stated": [asdict(row) for row in results.stated]}
+            for name, results in (("atlas", atlas), ("panda", panda))
+            if results is not None
+        }
+        written = f"panda-adapter {program_version()}, seed {args.seed}"
+        write_whole(folder / PAGE, render_experiment(atlas, panda, written))
+        write_json(folder / "experiment.json", figures)
+        write_json(args.json, figures)
     show(f"report {folder / PAGE}")
     return 0
-
-
-def _write(
-    args: argparse.Namespace, folder: Path, atlas: AtlasResults | None, panda: PandaResults | None
-) -> None:
-    figures = {
-        name: {**results.numbers, "stated": [asdict(row) for row in results.stated]}
-        for name, results in (("atlas", atlas), ("panda", panda))
-        if results is not None
-    }
-    written = f"panda-adapter {program_version()}, seed {args.seed}"
-    write_whole(folder / PAGE, render_experiment(atlas, panda, written))
-    write_json(folder / "experiment.json", figures)
-    write_json(args.json, figures)
 
 
 def print_stated(title: str, stated: list[Stated]) -> None:

@@ -38,7 +38,6 @@ STATIONARY = 0.05
 UNEXPLAINED = 0.05
 # Added to a curvature whose diagonal is 1: where samples show nothing, nothing moves.
 LEVENBERG = 1e-10
-LONGEST_STEP = 0.05  # of an iteration, rad and m
 POSITION_SPAN = 0.5  # starting positions are uniform within ± this, m; angles within ±π
 
 
@@ -128,7 +127,7 @@ def schema_by_networks(
         curvature = (1.0 - gain) * curvature + gain * own
         step = (gain * newton_step(slope, curvature)).unflatten(-1, (2, 3))
         length = step.norm(dim=-1, keepdim=True)  # of the turn and of the shift
-        share = (LONGEST_STEP / length.clamp_min(1e-300)).clamp_max(1.0)
+        share = (0.05 / length.clamp_min(1e-300)).clamp_max(1.0)  # of an iteration, rad and m
         frames = frames.moved((step * share).flatten(-2))
         losses[epoch] = cost.numpy()
     kept[total] = _lam(frames)
@@ -137,7 +136,12 @@ def schema_by_networks(
     chosen = {epoch: x[joints, best] for epoch, x in kept.items()}
     found = StartFrames(frames.r0[joints, best][:, None], frames.p[joints, best][:, None])
     loss = losses[:, joints, best].mean(axis=1)
-    return NetworkResult(chosen[total], chosen, loss, final, _converged(found, signals))
+    cost, slope, curvature = slope_and_curvature(found, signals)
+    left = -0.5 * (slope * newton_step(slope, curvature)).sum(dim=-1)
+    power = signals.power()[:, None]
+    at_minimum = (left <= STATIONARY * cost) & (cost <= UNEXPLAINED * power)
+    converged = ((cost <= ROUNDING * power) | at_minimum)[:, 0].numpy()
+    return NetworkResult(chosen[total], chosen, loss, final, converged)
 
 
 def _channels(data: TreeData) -> list[str]:
@@ -147,15 +151,6 @@ def _channels(data: TreeData) -> list[str]:
     with_speed = data.links.v is not None and data.base.v is not None
     by_twist = with_speed and data.tree.floating
     return ["w", *(["v"] if with_speed else []), *([] if by_twist else ["a"])]
-
-
-def _converged(frames: StartFrames, signals: NetworkSignals) -> np.ndarray:
-    """By joint (n,) of frames with one start each; see `NetworkResult`."""
-    cost, slope, curvature = slope_and_curvature(frames, signals)
-    gain = -0.5 * (slope * newton_step(slope, curvature)).sum(dim=-1)
-    power = signals.power()[:, None]
-    at_minimum = (gain <= STATIONARY * cost) & (cost <= UNEXPLAINED * power)
-    return ((cost <= ROUNDING * power) | at_minimum)[:, 0].numpy()
 
 
 def _lam(frames: StartFrames) -> Array:

@@ -21,10 +21,10 @@ from adapter.effects.base import Effect, LinearEffect
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.fit import EDGE_S, Fit
+from adapter.gap.held_out import pieces_of
 from adapter.gap.long_recording import LongRecording, Span
 from adapter.gap.real_arm import load_in, loaded_arm, nominal_fit, real_arm
 from adapter.gap.signals import RATE_HZ, regressor_of
-from adapter.gap.weighed import pieces_of
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.screening.screen import moving_joints

@@ -531,7 +531,15 @@ def shaped(fit: Fit, place: int) -> Fit:
     if not effect.reshaped(fit.named[place].values, 1.0):
         return fit
     if isinstance(effect, TorqueEffect) and not effect.by_load:
-        return _reshaped(fit, place)
+        # its own columns are all that changes; others stay as linear as they are
+        carried = fit.carried()
+        best, named = carried, fit.named[place]
+        for step in (3.0, *SHAPE_STEPS):  # where others stay as they are
+            for other in _other_shapes(named, step):
+                trial = _with_shape(fit, carried, place, other)
+                if trial.g @ trial.x > best.g @ best.x:
+                    best, named = trial, other
+        return fit.instead(place, named).at(best.x)
     for step in SHAPE_STEPS:
         named = fit.named[place]
         trials = [fit]
@@ -549,18 +557,6 @@ def _other_shapes(named: Named, step: float) -> list[Named]:
             template = replace(template, prior_std=own.template.prior_std)
             out.append(replace(named, candidate=replace(own, template=template)))
     return out
-
-
-def _reshaped(fit: Fit, place: int) -> Fit:
-    """The same where its own columns are all that changes; others stay as linear as they are."""
-    carried = fit.carried()
-    best, named = carried, fit.named[place]
-    for step in (3.0, *SHAPE_STEPS):  # where others stay as they are
-        for other in _other_shapes(named, step):
-            trial = _with_shape(fit, carried, place, other)
-            if trial.g @ trial.x > best.g @ best.x:
-                best, named = trial, other
-    return fit.instead(place, named).at(best.x)
 
 
 def between(fit: Fit, place: int, value: float, step: float, at: Callable[[float], Named]) -> Fit:

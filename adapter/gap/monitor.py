@@ -154,7 +154,14 @@ class Monitor:
         for row in rows:
             self._rows.append(row)
             if len(self._rows) == ROWS_PER_GROUP:
-                self._take(learner, self._frames)
+                # a full group: judge the window with it, and let the oldest into the belief
+                t, table = (np.array(column) for column in zip(*self._rows, strict=True))
+                self._rows = []
+                self._groups.append(self._group(learner, self._frames, t, table))
+                if len(self._groups) > GROUPS:
+                    self._absorb(self._groups.pop(0))
+                if len(self._groups) == GROUPS:
+                    self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
     def _take_over(self, learner: OnlineLearner) -> None:
         """Start from what the learner knows."""
@@ -185,16 +192,6 @@ class Monitor:
         own = slice(10 * self._n, self._size)
         squares = np.square(self._belief.mean()[own]) + np.square(self._belief.std()[own])
         return np.asarray(squares.reshape(-1, self._n))
-
-    def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
-        """A group is full: judge the window with it, and let the oldest group into the belief."""
-        t, table = (np.array(column) for column in zip(*self._rows, strict=True))
-        self._rows = []
-        self._groups.append(self._group(learner, frames, t, table))
-        if len(self._groups) > GROUPS:
-            self._absorb(self._groups.pop(0))
-        if len(self._groups) == GROUPS:
-            self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
     def _group(
         self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array

@@ -1,8 +1,12 @@
 """Several recordings of one arm: what each hand carries, and which recordings contradict the rest.
 
 Inertias, friction, offsets and motor inertia are common to all recordings, the load is each one's
-own; all are fitted together by `together`. Errors of the model that all recordings share cancel
+own; all are fitted in one least squares. Errors of the model that all recordings share cancel
 between them, so that loads compare far better than each is known by itself.
+
+Each recording's own coefficients are eliminated from its own products; what is left of these is
+about the common ones alone and adds up (a Schur complement, recording by recording). So the work
+grows with the number of recordings, and not with its square.
 """
 
 from __future__ import annotations
@@ -14,15 +18,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from adapter.effects.active import SHOWN_STD
 from adapter.effects.catalogue import HELD
-from adapter.gap.evidence import Noise
-from adapter.gap.fit import Fit, place_of
+from adapter.gap.evidence import Carried, Noise
+from adapter.gap.fit import BLOCK, Fit, place_of
 from adapter.gap.load import HandLoad, load_of
 from adapter.gap.real_arm import fitting_way, with_a_load
 from adapter.gap.result import Finding, GapResult, LogLoad
-from adapter.gap.together import Part, Together
 from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import Array
@@ -76,7 +80,9 @@ class Several:
             own = [fit.own_noise()[0] for fit in fits]
             level, memory = np.median([(x.level, x.memory) for x in own], axis=0)
             fits = [fit.with_noise([Noise(level, memory)]) for fit in fits]
-            parts = [Part.of(fit, _own(fit)) for fit in fits]
+            # a recording's own is all between the timing and the end of its load
+            places = [np.arange(f.dtheta.size + 1, place_of(f, 0)[-1] + 1) for f in fits]
+            parts = [Part.of(fit, place) for fit, place in zip(fits, places, strict=True)]
             together = Together(parts, parts[0].known.prior_std[parts[0].common])
             fits = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
             if first:
@@ -169,11 +175,6 @@ def _row(name: str, load: HandLoad) -> LogLoad:
     return LogLoad(name, load.is_there, load.mass, load.mass_std, com, std, load.frame)
 
 
-def _own(fit: Fit) -> np.ndarray:
-    """Places of what is a recording's own: all between the timing and the end of its load."""
-    return np.arange(fit.dtheta.size + 1, place_of(fit, 0)[-1] + 1)
-
-
 def _apart(nominal: Fit, i: int) -> Fit:
     """One recording alone, with a load, and all that may be beside it."""
     named = with_a_load(nominal)
@@ -249,3 +250,106 @@ def _directions(fit: Fit, x: Array) -> Iterator[tuple[str, str, Array]]:
 def _together_in(unit: Array, places: Array, x: Array) -> Array:
     """(1, c) coefficients at these places, in the proportion that they have."""
     return np.asarray((x[places] @ unit[places])[None])
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One recording's share.
+
+    Attributes:
+        known: of all its coefficients; own: (o,) places of its own; common: (c,) of the others.
+        G: (c, c) what it knows of the common ones, its own eliminated; g: (c,) with its data.
+        free: (o, o) covariance of its own where the common ones are known.
+        cross: (o, c) its own with the common ones.
+        rows: of the white signatures that a second has.
+    """
+
+    known: Carried
+    own: np.ndarray
+    common: np.ndarray
+    G: Array
+    g: Array
+    free: Array
+    cross: Array
+    rows: int
+
+    @classmethod
+    def of(cls, fit: Fit, own: np.ndarray) -> Part:
+        """From the fit of one recording."""
+        known = fit.carried()
+        common = np.delete(np.arange(len(known.g)), own)
+        A = known.G[np.ix_(own, own)] + np.diag(known.prior_std[own] ** -2.0)
+        free = cho_solve(cho_factor(A, lower=True), np.eye(len(own)))
+        cross = known.G[np.ix_(own, common)]
+        G = known.G[np.ix_(common, common)] - cross.T @ free @ cross
+        g = known.g[common] - cross.T @ free @ known.g[own]
+        return cls(known, own, common, G, g, free, cross, BLOCK * fit.n)
+
+    def own_at(self, x: Array) -> Array:
+        """(o,) its own coefficients where the common ones are x (c,)."""
+        return np.asarray(self.free @ (self.known.g[self.own] - self.cross @ x))
+
+    def all_at(self, x: Array) -> Array:
+        """All its coefficients, in its order, where the common ones are x (c,)."""
+        out = np.empty(len(self.known.g))
+        out[self.common], out[self.own] = x, self.own_at(x)
+        return out
+
+    def scores(self, x: Array) -> tuple[Array, Array]:
+        """Of its seconds, (s, c) what each adds to `g - G x`, and (s, o) to its own gradient."""
+        left = self.known.data - self.all_at(x) @ self.known.N
+        cuts = np.arange(0, len(left), self.rows)
+        sums = np.add.reduceat(self.known.N * left, cuts, axis=1).T
+        own = sums[:, self.own]
+        return sums[:, self.common] - own @ self.free @ self.cross, own
+
+
+class Together:
+    """Recordings in one least squares.
+
+    Args:
+        parts: theirs, with the same common coefficients in the same order.
+        prior_std: (c,) of the common coefficients.
+
+    Attributes:
+        x: (c,) the common coefficients; covariance: (c, c) of them.
+    """
+
+    def __init__(self, parts: Sequence[Part], prior_std: Array) -> None:
+        self.parts, self.prior = parts, np.diag(prior_std**-2.0)
+        self.G = np.sum([part.G for part in parts], axis=0) + self.prior
+        self.g = np.sum([part.g for part in parts], axis=0)
+        self.covariance = np.linalg.inv(self.G)
+        self.x = self.covariance @ self.g
+
+    @cached_property
+    def scores(self) -> list[tuple[Array, Array]]:
+        """Of each part, see there."""
+        return [part.scores(self.x) for part in self.parts]
+
+    @cached_property
+    def spread(self) -> Array:
+        """(c, c) by how much the seconds of all recordings disagree, and the prior with them."""
+        return np.asarray(np.sum([x.T @ x for x, _ in self.scores], axis=0) + self.prior)
+
+    def own(self, i: int) -> tuple[Array, Array]:
+        """(o,) the i-th recording's own coefficients, and (o, o) their covariance.
+
+        By the noise, and no less than by what seconds disagree: what a model gets wrong does not
+        average out as noise does (White 1980, by clusters).
+        """
+        part, (common, mine) = self.parts[i], self.scores[i]
+        H = part.free @ part.cross @ self.covariance
+        plain = part.free + H @ part.cross.T @ part.free
+        off = mine @ part.free - common @ H.T
+        prior = np.diag(part.known.prior_std[part.own] ** -2.0)
+        robust = off.T @ off + H @ (self.spread - common.T @ common) @ H.T
+        robust += part.free @ prior @ part.free
+        wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
+        return part.own_at(self.x), plain * np.outer(wider, wider)
+
+    def without(self, i: int) -> tuple[Array, Array]:
+        """(c,) the common coefficients by all recordings but the i-th, and (c, c) covariance."""
+        part = self.parts[i]
+        covariance = np.linalg.inv(self.G - part.G)
+        return covariance @ (self.g - part.g), covariance

@@ -28,7 +28,7 @@ from adapter.effects.base import Motion
 from adapter.effects.by_joint import SMOOTHING_DQ, slowness
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.rows import pauses, stuck
+from adapter.screening.screen import pauses, stuck
 from adapter.signals.filters import noise_from_samples
 from drivers.files.mcap import Log
 

@@ -228,22 +228,19 @@ def _group(findings: Sequence[Finding]) -> str:
     if len(findings) == 1:
         return sentence(findings[0])
     first = findings[0]
-    if first.recording and first.throughout:
-        return _in_recordings(findings)
+    if first.recording and first.throughout:  # several recordings have it, each for itself
+        key = phrase_of(first).key
+        sizes = [
+            abs(float(f.parameters[key])) for f in findings if f.parameters.get(key) is not None
+        ]
+        unit = first.units.get(key, "")
+        size = f" of {plain(min(sizes), 2)} to {plain(max(sizes), 2)} {unit}" if sizes else ""
+        return f"{first.title}{size} in {len({f.recording for f in findings})} recordings"
     ordered = sorted(findings, key=lambda f: f.joints)
     joints = [j for f in ordered for j in f.joints]
     verb = phrase_of(first).verb
     said = f"{who(first.effect, joints)} {verb} {first.title}{_values(ordered)}"
     return f"{span(first)} {said}" if span(first) else said
-
-
-def _in_recordings(findings: Sequence[Finding]) -> str:
-    """What several recordings have, each for itself."""
-    key = phrase_of(findings[0]).key
-    values = [abs(float(f.parameters[key])) for f in findings if f.parameters.get(key) is not None]
-    unit = findings[0].units.get(key, "")
-    size = f" of {plain(min(values), 2)} to {plain(max(values), 2)} {unit}" if values else ""
-    return f"{findings[0].title}{size} in {len({f.recording for f in findings})} recordings"
 
 
 def _values(findings: Sequence[Finding]) -> str:

@@ -110,7 +110,13 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     for part, names in _STATE.items():
         owner = attrgetter(part)(learner) if part else learner
         for name in names if owner is not None else ():
-            _put(owner, name, arrays.get(f"{part}.{name}"))
+            value = arrays.get(f"{part}.{name}")
+            if value is None:
+                setattr(owner, name, None)
+            elif value.ndim and isinstance(getattr(owner, name), np.ndarray):
+                getattr(owner, name)[...] = value  # ADAM and the parts share their memory
+            else:
+                setattr(owner, name, value if value.ndim else value.item())
     learner.schema.kind = LinkMotionKind(learner.schema.kind)
     more = {key.removeprefix(MORE): x for key, x in arrays.items() if key.startswith(MORE)}
     learner.schema.take_state(more)
@@ -118,16 +124,6 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
     learner.changes[:] = arrays[".changes"].tolist()
     learner.adam.steps = int(arrays["adam.steps"])
-
-
-def _put(owner: object, name: str, value: np.ndarray | None) -> None:
-    """Set an attribute; arrays in place, since ADAM and the parts share their memory."""
-    if value is None:
-        setattr(owner, name, None)
-    elif value.ndim and isinstance(getattr(owner, name), np.ndarray):
-        getattr(owner, name)[...] = value
-    else:
-        setattr(owner, name, value if value.ndim else value.item())
 
 
 def _about(learner: OnlineLearner) -> str:

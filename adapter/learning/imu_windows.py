@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.model.spatial import Array
-from adapter.signals.base_motion import LONGEST_PERIODS
+from adapter.signals.frame_topics import LONGEST_PERIODS
 
 STEP_S = 0.005  # of the grid
 KNOT_S = 0.06  # between two knots of the bell, and from one window to the next

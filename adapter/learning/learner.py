@@ -475,8 +475,9 @@ class OnlineLearner:
         if self._shadow is not None:
             self._rebuild_some(len(table))
         self._look_on(table, error)
-        if self.theta.restart_due(self.theta.weight * len(table)):
-            self.theta.restart_spare()
+        theta, before = self.theta, self.theta.count - self.theta.weight * len(table)
+        if theta.spare_in_use and any(before < k <= theta.count for k in theta.settings.restarts):
+            theta.restart_spare()
             self.adam.forget(slice(6 * self.tree.n, None))  # momentum is of no use after a jump
         return True
 

@@ -37,7 +37,6 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import StateLayout
 
 # Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
-NEUTRAL_MASS = 1.0  # kg
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
 
 REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
@@ -62,7 +61,7 @@ HANGING_SHARE = 0.03
 
 def neutral_body() -> Array:
     """(10,) what is believed of a link before any data."""
-    return theta_from_body(NEUTRAL_MASS, np.zeros(3), 0.02 * np.eye(3))  # kg m², about every axis
+    return theta_from_body(1.0, np.zeros(3), 0.02 * np.eye(3))  # kg; kg m², about every axis
 
 
 @dataclass(frozen=True)
@@ -349,11 +348,6 @@ class Theta:
             return _NOTHING
         square = self.moments.base_level.reshape(2, 3).mean(axis=1)
         return self._wrench / (self.noise_gain * (square + self.model_variance))
-
-    def restart_due(self, added: float) -> bool:
-        """Whether the newest samples reached a restart of the spare body."""
-        before = self.count - added
-        return self.spare_in_use and any(before < k <= self.count for k in self.settings.restarts)
 
     def restart_spare(self) -> None:
         """Put the spare body to the hand plus the point mass that fits the data best.

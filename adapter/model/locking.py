@@ -58,7 +58,11 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
         raise ModelError(f"{model.name}: {', '.join(of_arm)} may act on {last}, which stays free")
     whole = model.with_base(True)  # the base is a body like the others meanwhile
     carrier, placement = _carriers(whole.tree, whole.lam, at)
-    theta, std = _bodies(whole, carrier, placement, at)
+    theta, variance = whole.theta.copy(), whole.theta_std**2  # with locked links on their carriers
+    for k in at:
+        share = move_theta(np.eye(10), *placement[k])  # row i: of a unit of parameter i
+        theta[carrier[k] + 1] += whole.theta[k + 1] @ share
+        variance[carrier[k] + 1] += variance[k + 1] @ share**2
     lam, moved = _joint_frames(whole.tree, whole.lam, at)
     lam_std = whole.lam_std[kept]
     lam_std[moved] = np.nan  # two frames became one
@@ -81,7 +85,7 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
         lam=lam,
         lam_std=lam_std,
         theta=theta[rows],
-        theta_std=std[rows],
+        theta_std=np.sqrt(variance[rows]),
         limits=Limits(*(getattr(whole.limits, key)[kept] for key in LIMITS)),
         axis=whole.axis[kept],
         frames=_frames(whole, carrier, placement, at),
@@ -124,18 +128,6 @@ def _joint_frames(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[Arra
             changed[k] = np.r_[turn, p + r @ lam[k, 3:]]
             moved.append(kept.index(k))
     return changed[kept], moved
-
-
-def _bodies(
-    model: SelfModel, carrier: Mapping[int, int], placement: Placement, at: Mapping[int, float]
-) -> tuple[Array, Array]:
-    """θ and its standard deviations, locked links added to what carries them."""
-    theta, variance = model.theta.copy(), model.theta_std**2
-    for k in at:
-        moved = move_theta(np.eye(10), *placement[k])  # row i: of a unit of parameter i
-        theta[carrier[k] + 1] += model.theta[k + 1] @ moved
-        variance[carrier[k] + 1] += variance[k + 1] @ moved**2
-    return theta, np.sqrt(variance)
 
 
 def _frames(

@@ -27,7 +27,6 @@ from adapter.model.spatial import Array
 DIGITS = 8  # of a root in a file: the best known combinations are some 1e-5 of the single numbers
 REDRAWN, HALVED = 20, 12  # times, of a draw whose bodies cannot exist
 FAR = 1e3  # times rounding: as near as a drawn body comes to one that cannot exist
-NEWTON = 30  # steps to the middle of what is possible; it takes a dozen
 Label = tuple[str, int, str]  # effect, joint (from 1; 0 without one) and key of one of its numbers
 
 
@@ -96,7 +95,7 @@ def room_of(theta: Array, basis: Array) -> Array:
             return -np.inf
         return float(np.linalg.slogdet(pseudo_inertia(bodies))[1].sum() - 0.5 * y @ y)
 
-    for _ in range(NEWTON):
+    for _ in range(30):  # steps to the middle of what is possible; it takes a dozen
         inverse = np.linalg.inv(pseudo_inertia(theta + np.tensordot(at, ways, 1)))
         part = inverse @ slopes  # (h, n, 4, 4)
         gradient = np.trace(part, axis1=2, axis2=3).sum(axis=1) - at

@@ -238,20 +238,17 @@ class LearnedFeedforward(EstimateFollower, Feedforward):
         apart = tau - documented
         beyond = np.abs(apart) > self._most
         if beyond.any():
-            self._fall_back(int(np.argmax(beyond)), apart)
+            j, self._believed = int(np.argmax(beyond)), False
+            if not self.notes:
+                self.notes.append(
+                    f"the learned torque of joint {j + 1} was {apart[j]:.1f} N m from the "
+                    f"documented model's (at most {self._most[j]:.1f} N m are believed); "
+                    "feed-forward fell back to the documented model"
+                )
             apart = np.minimum(np.maximum(apart, -self._most), self._most)
         step = 1.0 / FADE_CALLS
         self._trust = min(max(self._trust + (step if self._believed else -step), 0.0), 1.0)
         return documented + self._trust * apart
-
-    def _fall_back(self, j: int, apart: Array) -> None:
-        self._believed = False
-        if not self.notes:
-            self.notes.append(
-                f"the learned torque of joint {j + 1} was {apart[j]:.1f} N m from the documented "
-                f"model's (at most {self._most[j]:.1f} N m are believed); feed-forward fell back "
-                "to the documented model"
-            )
 
     def unbent(self, q: Array) -> Array:
         """Torques (n,) N m of holding still with nothing bent."""

@@ -160,7 +160,15 @@ class LearnerTask:
             learner = self.job.make()
             if "torch" in sys.modules:
                 sys.modules["torch"].set_num_threads(1)
-            self._take_over(learner, ring)
+            # go on where a dead predecessor's last kept state ends
+            index = 0
+            if self.keep_in is not None and self.job.restore is not None:
+                index = max(
+                    (int(p.name) for p in self.keep_in.iterdir() if p.name.isdigit()), default=0
+                )
+                if index:
+                    self.job.restore(learner, self.keep_in / str(index))
+            ring.resume(index)
             port.ready()
             self._feed(learner, ring, board, port)
             return self.job.collect(learner)
@@ -169,17 +177,6 @@ class LearnerTask:
             leave(port.orphaned, names, ring, board)
             if port.orphaned and self.keep_in is not None:
                 shutil.rmtree(self.keep_in, ignore_errors=True)
-
-    def _take_over(self, learner: Any, ring: Ring) -> None:
-        """Go on where a dead predecessor's last kept state ends."""
-        index = 0
-        if self.keep_in is not None and self.job.restore is not None:
-            index = max(
-                (int(p.name) for p in self.keep_in.iterdir() if p.name.isdigit()), default=0
-            )
-            if index:
-                self.job.restore(learner, self.keep_in / str(index))
-        ring.resume(index)
 
     def _feed(self, learner: Any, ring: Ring, board: SnapshotWriter | None, port: Port) -> None:
         job = self.job

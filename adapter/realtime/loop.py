@@ -259,7 +259,12 @@ class _Loop:
             samples = session.samples
             goes_on = session.tick()
             if session.samples > samples:
-                self._note_times(first=not ticks)
+                plant_ns = getattr(driver, "plant_time_ns", 0) if ticks else 0
+                age_ns = session.had_ns - driver.arrived_ns if driver.arrived_ns else None
+                if driver.paced:
+                    self._clock.follow(session.began_ns)
+                ended_ns = time.monotonic_ns()
+                self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
             ticks += 1
             if stop.count:
                 session.begin_stop(Ended.INTERRUPTED)
@@ -274,15 +279,6 @@ class _Loop:
                     session.begin_stop(Ended.DURATION)
         if stop.count > 1:
             session.begin_stop(Ended.INTERRUPTED)
-
-    def _note_times(self, first: bool) -> None:
-        driver, session = self._driver, self._session
-        plant_ns = 0 if first else getattr(driver, "plant_time_ns", 0)
-        age_ns = session.had_ns - driver.arrived_ns if driver.arrived_ns else None
-        if driver.paced:
-            self._clock.follow(session.began_ns)
-        ended_ns = time.monotonic_ns()
-        self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
 
     def result(self, grants: list[str], collected: Any) -> LiveResult:
         """What became of the run."""

@@ -156,7 +156,15 @@ class Session:
         self._keep(sample, command, external)
         if trouble is not None:
             return self._end(Ended.DRIVER_ERROR, trouble)
-        return self._goes_on(sample.stamp_ns)
+        self._elapsed_ns += self._clock.step(sample.stamp_ns)
+        self.elapsed_s = 1e-9 * self._elapsed_ns
+        if self._duration_s is not None and self.elapsed_s >= self._duration_s:
+            self.begin_stop(Ended.DURATION)
+        if self._stopping_at_s is None:
+            return True
+        if self._controller is None or self._controller.at_rest:
+            return False
+        return self.elapsed_s < self._stopping_at_s + STOP_LIMIT_S
 
     def _move(self, sample: JointSample) -> tuple[Array | None, str | None]:
         if self._controller is None:
@@ -182,17 +190,6 @@ class Session:
             self._stopping_at_s, self.ended = self.elapsed_s, why
             if self._controller is not None:
                 self._controller.begin_stop()
-
-    def _goes_on(self, stamp_ns: int) -> bool:
-        self._elapsed_ns += self._clock.step(stamp_ns)
-        self.elapsed_s = 1e-9 * self._elapsed_ns
-        if self._duration_s is not None and self.elapsed_s >= self._duration_s:
-            self.begin_stop(Ended.DURATION)
-        if self._stopping_at_s is None:
-            return True
-        if self._controller is None or self._controller.at_rest:
-            return False
-        return self.elapsed_s < self._stopping_at_s + STOP_LIMIT_S
 
     def _end(self, why: Ended, fault: str) -> bool:
         self.ended, self.fault = why, None if why == Ended.END_OF_STREAM else fault

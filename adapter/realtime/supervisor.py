@@ -111,7 +111,15 @@ class Supervisor:
         if jobs.learner is not None:
             self.states = Ring.create(self._state_size, rows)
             self.board = self._new_board(jobs.learner)
-            self.learner = self._start_learner(jobs.learner, self.states, self.board.name)
+            lasting = jobs.learner.keep is not None and jobs.learner.restore is not None
+            if lasting:
+                self._folder = Path(tempfile.mkdtemp(prefix="adapter-learner-"))
+            task = LearnerTask(jobs.learner, self.states.name, self.board.name, self._folder)
+            name = "learner process"
+            most, lost = RESTARTS if lasting else 0, "nothing more is learned"
+            self.learner = self._restartable(
+                name, lambda k: Worker(name, task, self._cores), most, lost
+            )
         board = None if self.board is None else self.board.name
         if jobs.recording or jobs.display or jobs.view:
             self.loop_board = LoopBoard.create()
@@ -147,15 +155,6 @@ class Supervisor:
             build = partial(Worker, name, task, self._cores)
             lost = "nothing more is shown"
             self.view = self._restartable(name, lambda k: build(), RESTARTS, lost)
-
-    def _start_learner(self, job: LearnerJob, ring: Ring, board: str) -> RestartableWorker:
-        lasting = job.keep is not None and job.restore is not None
-        if lasting:
-            self._folder = Path(tempfile.mkdtemp(prefix="adapter-learner-"))
-        task = LearnerTask(job, ring.name, board, self._folder)
-        name = "learner process"
-        most, lost = RESTARTS if lasting else 0, "nothing more is learned"
-        return self._restartable(name, lambda k: Worker(name, task, self._cores), most, lost)
 
     def _start_recorder(
         self, job: RecordingJob, ring: Ring, board: str | None

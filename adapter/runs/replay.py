@@ -145,7 +145,7 @@ def replay(
     if documented.tree.floating and log.base is None:
         raise DriverError(
             f"{log.path}: the base of {documented.name} floats, and nothing of its motion was read "
-            "(read_log with frames, then base_motion.with_base_motion)"
+            "(read_log with frames, then frame_topics.with_base_motion)"
         )
     pipeline = Pipeline(documented, settings)
     if every == 1:  # a batch learns of everything before it could tell what is new

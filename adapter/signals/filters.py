@@ -30,7 +30,6 @@ from adapter.signals.settings import FilterSettings
 # Third differences have 1 + 9 + 9 + 1 times the variance of white noise, and next to no motion.
 THIRD_DIFFERENCE_GAIN = 20.0
 
-USUAL_DQ_NOISE = 5e-3  # rad/s, of a Panda
 SETTLING_DELAYS = 4  # after so many delays a start has faded to 1e-2
 NEVER = -(2**62)  # a stamp before all others
 
@@ -43,7 +42,7 @@ def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
     from filterpy.kalman import KalmanFilter
 
     period = settings.step_s
-    noise = USUAL_DQ_NOISE if settings.dq_noise is None else settings.dq_noise
+    noise = 5e-3 if settings.dq_noise is None else settings.dq_noise  # rad/s, of a Panda
     noise *= math.sqrt(settings.states_per_sample)  # as if each step brought a sample of its own
     drive = settings.dq_drive
     if drive is None:

@@ -81,18 +81,15 @@ class SourceTable:
         elif match := re.fullmatch(r"(\d*):(\d*)", selector):
             first, last = int(match[1] or 0), int(match[2] or count)
         else:
-            return self._named(selector, what)
+            places = self.found(selector)
+            if not places:
+                having = self._having() or f"; it has no header, name columns 0 to {len(self) - 1}"
+                raise DriverError(f"{self.path}: no column '{selector}' for {what}{having}")
+            return places
         if not first < last <= count:
             has = f"it has {count} columns, 0 to {count - 1}{self._having()}"
             raise DriverError(f"{self.path}: column {selector} for {what} isn't there; {has}")
         return list(range(first, last))
-
-    def _named(self, selector: str, what: str) -> list[int]:
-        places = self.found(selector)
-        if not places:
-            having = self._having() or f"; it has no header, name columns 0 to {len(self) - 1}"
-            raise DriverError(f"{self.path}: no column '{selector}' for {what}{having}")
-        return places
 
     def found(self, selector: str) -> list[int]:
         """Places of the columns of that name, else of that list, else of that pattern."""

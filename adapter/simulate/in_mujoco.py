@@ -39,7 +39,13 @@ class MujocoArm(SimulatedArm):
     ) -> None:
         self._mujoco = optional.load("mujoco")
         if simulated is None:
-            simulated = _alone(self._mujoco, model, period_s)
+            try:
+                alone = self._mujoco.MjModel.from_xml_string(plain_urdf(model))
+            except ValueError as error:
+                raise ModelError(f"MuJoCo does not take {model.name}: {error}") from None
+            alone.opt.timestep = period_s
+            alone.opt.gravity[:] = np.asarray(model.gravity)
+            simulated = alone, self._mujoco.MjData(alone)
         self.model, self.data = simulated
         super().__init__(Effects(model, float(self.model.opt.timestep), "bodies and armature"))
         joints = [self._joint(name) for name in model.tree.joint_names]
@@ -100,14 +106,3 @@ class MujocoArm(SimulatedArm):
         if self.model.jnt_type[number] != self._mujoco.mjtJoint.mjJNT_HINGE:
             raise ModelError(f"joint '{name}' is no hinge in MuJoCo's model")
         return number
-
-
-def _alone(mujoco: Any, model: SelfModel, period_s: float) -> tuple[Any, Any]:
-    """Model and data of the arm by itself. Raises ModelError."""
-    try:
-        simulated = mujoco.MjModel.from_xml_string(plain_urdf(model))
-    except ValueError as error:
-        raise ModelError(f"MuJoCo does not take {model.name}: {error}") from None
-    simulated.opt.timestep = period_s
-    simulated.opt.gravity[:] = np.asarray(model.gravity)
-    return simulated, mujoco.MjData(simulated)

@@ -25,7 +25,6 @@ from adapter.signals.records import StateLayout, stamp_of
 
 ROWS_A_LOOK = 8  # states of which the residual is computed, spread over those since the last look
 RMS_S, LATELY_S = 1.0, 5.0  # of residuals; of timing
-FRAMES_EVERY = 1000  # states; they take milliseconds
 ABOVE_NOISE = 2.0  # times the noise, beyond which a residual is said to be more
 BEHIND = 1000  # samples that wait for the learner, beyond which it is said
 WAITING, LEARNING, CONVERGED = "waiting", "learning", "converged"
@@ -236,7 +235,7 @@ class Onlooker:
             seen = frame_observability(documented.tree, lam, documented.gravity)
             found = nearest_frames(seen.freedom, lam, documented.lam)
             self._frames = LearnedFrames(*found, snapshot.lam_std, ~seen.flags)
-            self._frames_of = snapshot.learned + FRAMES_EVERY
+            self._frames_of = snapshot.learned + 1000  # states; they take milliseconds
         return self._frames
 
     @cached_property

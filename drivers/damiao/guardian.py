@@ -168,8 +168,11 @@ class Guardian:
                 continue
             if self._braker is None or mode != self._mode:
                 self._braker = self._begin(mode, alive)
-            if not alive:
-                leave_pipe()
+            if not alive and stat.S_ISFIFO(os.fstat(2).st_mode):
+                # whoever reads the ended program's output through a pipe is not to wait for us
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, 2)
+                os.close(nowhere)
             if self.ended:
                 self._let_down(self._braker)
                 return
@@ -275,14 +278,6 @@ class Guardian:
             print(f"guardian {os.getpid()}: {sentence}", file=sys.stderr, flush=True)
         except OSError:
             return  # the terminal is gone
-
-
-def leave_pipe() -> None:
-    """Whoever reads the ended program's output through a pipe is not to wait for us."""
-    if stat.S_ISFIFO(os.fstat(2).st_mode):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        os.close(nowhere)
 
 
 def open_lock(settings: BusSettings) -> int:

@@ -114,7 +114,10 @@ def _fault(text: str) -> Fault:
     name = re.split(r"[:=@]", text, maxsplit=1)[0]
     if name not in KINDS:
         raise DriverError(f"no fault '{name}'; {choices(name, KINDS)}")
-    kind, usage = KINDS[name], usage_of(name)
+    kind = KINDS[name]
+    more = "" if kind.amount is None else f"[+AMOUNT{f' in {kind.unit}' if kind.unit else ''}]"
+    when = f"{':JOINT' if kind.joint else ''}{'@SECONDS' if kind.timed else '=SHARE'}"
+    usage = f"{name}{when}{more} ({kind.says})"
     found = _ITEM.fullmatch(text)
     if found is None or kind.timed != (found["how"] == "@"):
         raise DriverError(f"fault '{text}' cannot be read; write {usage}")
@@ -134,12 +137,3 @@ def _fault(text: str) -> Fault:
     if not value < 1.0:
         raise DriverError(f"fault '{text}': the share has to be from 0 to below 1")
     return Fault(name, share=value, amount=amount)
-
-
-def usage_of(name: str) -> str:
-    """How a fault of this kind is written, for people."""
-    kind = KINDS[name]
-    joint = ":JOINT" if kind.joint else ""
-    unit = f" in {kind.unit}" if kind.unit else ""
-    amount = "" if kind.amount is None else f"[+AMOUNT{unit}]"
-    return f"{name}{joint}{'@SECONDS' if kind.timed else '=SHARE'}{amount} ({kind.says})"

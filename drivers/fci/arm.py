@@ -33,8 +33,6 @@ _NAMES = {
     version: tuple(f"{robot}_joint{i}" for i in range(1, JOINTS + 1))
     for version, robot in _ROBOTS.items()
 }
-_LIMP_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP)
-_RECOVERING_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY)
 
 
 class FciArm:
@@ -206,7 +204,7 @@ class FciArm:
             assert self._connection is not None
             recover(self._connection)
             deadline = time.monotonic() + RECOVERED_S
-            while state.status.robot_mode in _RECOVERING_MODES:
+            while state.status.robot_mode in (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY):
                 if time.monotonic() > deadline:
                     raise NotReady(
                         f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
@@ -234,7 +232,7 @@ class FciArm:
     def _note_status(self, status: Status) -> None:
         """While only listening, a robot that cannot move is worth a sentence, not an end."""
         mode = status.robot_mode
-        if mode in _LIMP_MODES:
+        if mode in (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP):
             why = f" ({told(status.reflex_reason)})" if any(status.reflex_reason) else ""
             sentence = f"the robot {tables.ROBOT_MODE_MEANING[mode]}{why}"
             self.intake.note(f"mode {mode}", sentence)

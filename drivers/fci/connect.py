@@ -16,8 +16,6 @@ from drivers.fci.codec import StateDecoder, WireError
 from drivers.fci.reader_client import ReaderClient, open_udp
 from drivers.interface import DriverError, NotReady
 
-CONNECT_LIMIT_S = 5.0
-_CHUNK = 1 << 16
 REPLY_LIMIT_S = 5.0
 RECOVERY_LIMIT_S = 10.0
 FIRST_STATE_S = 1.0  # for the length of the first state, which tells the version as well
@@ -41,9 +39,7 @@ class Channel:
     def __init__(self, host: str, port: int) -> None:
         where = f"{host}:{port}"
         try:
-            self._tcp = socket.create_connection(
-                (socket.gethostbyname(host), port), CONNECT_LIMIT_S
-            )
+            self._tcp = socket.create_connection((socket.gethostbyname(host), port), timeout=5.0)
         except ConnectionRefusedError as error:
             here = "start `adapter sim fci` and wait until it says that it is ready"
             robot = "switch the robot on, unlock its brakes and activate FCI in Desk"
@@ -83,7 +79,7 @@ class Channel:
         """Take what has arrived. Raises WireError for what no robot says."""
         while not self.closed:
             try:
-                data = self._tcp.recv(_CHUNK)
+                data = self._tcp.recv(1 << 16)
             except BlockingIOError:
                 return
             except OSError:

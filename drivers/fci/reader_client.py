@@ -19,7 +19,6 @@ from drivers.interface import DriverError
 
 # A reader that wakes up asks for the interpreter lock and waits this long before the running
 # thread is told to give it up. Python's default of 5 ms is five ticks of the robot.
-SWITCH_INTERVAL_S = 50e-6
 RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
 _SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
 SPARE_AFTER = 100  # records after a takeover; to start a process takes some of the robot's ticks
@@ -39,7 +38,7 @@ class QuickSwitching:
         with self._lock:
             if self._users == 0:
                 self._before_s = sys.getswitchinterval()
-                sys.setswitchinterval(min(self._before_s, SWITCH_INTERVAL_S))
+                sys.setswitchinterval(min(self._before_s, 50e-6))
             self._users += 1
 
     def end(self) -> None:

@@ -55,21 +55,19 @@ def parse(address: str, options: Mapping[str, str]) -> tuple[float | None, Load 
             f"'{address}': collision is a factor from {LEAST:g} to {MOST:g}, or {KEEP}"
         ) from error
     try:
-        return collision, None if load == KEEP else read_load(load)
+        if load == KEEP:
+            return collision, None
+        mass, *com = map(float, load.split(","))  # a solid ball of hand size, m from the flange
+        com = com or [0.0, 0.0, 0.0]
+        if len(com) != 3 or not 0.0 <= mass <= HEAVIEST_KG or not all(abs(x) <= 1.0 for x in com):
+            raise ValueError
+        ball = 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3)
+        return collision, Load(mass, np.array(com), ball.ravel())
     except ValueError as error:
         raise DriverError(
             f"'{address}': load is KG or KG,X,Y,Z (m from the flange) up to {HEAVIEST_KG:g} kg, "
             f"or {KEEP}"
         ) from error
-
-
-def read_load(text: str) -> Load:
-    """A solid ball of hand size, of `?load=KG[,X,Y,Z]`, m from the flange. Raises ValueError."""
-    mass, *com = (float(part) for part in text.split(","))
-    com = com or [0.0, 0.0, 0.0]
-    if len(com) != 3 or not 0.0 <= mass <= HEAVIEST_KG or not all(abs(x) <= 1.0 for x in com):
-        raise ValueError
-    return Load(mass, np.array(com), 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3).ravel())
 
 
 class RobotSettings:

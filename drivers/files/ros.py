@@ -29,7 +29,6 @@ _MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a do
 IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
 ODOMETRY_DOUBLES = 85  # pose 7, its covariance 36, twist 6 (child frame), its covariance 36
 # flags before the joint state of a FrankaRobotState: 4 vectors, 2 of joints
-_COLLISION_DOUBLES = 26
 # of a FrankaState behind its header: two of flags, q q_d dq dq_d ddq_d theta dtheta tau
 _FRANKA_RUNS = (6, 6, 7, 7, 7, 7, 7, 7, 7, 7)
 
@@ -138,7 +137,7 @@ def parse_franka_robot_state(data: Bytes) -> Layout:
     """Layout of a FrankaRobotState: the runs of its measured joint state. Raises CdrError."""
     cursor = _Cursor(data)
     cursor.text()
-    flags = cursor.doubles(_COLLISION_DOUBLES)
+    flags = cursor.doubles(26)
     stamp = cursor.stamp()
     frame_id, names, runs = cursor.joint_state()
     return Layout(cursor.little, frame_id, names, runs, (flags, stamp, *runs))

@@ -11,7 +11,6 @@ from drivers.interface import DriverError
 
 OPTIONS = ("command", "domain", "local", "hz", "joints", "effort", "gravity", "timeout_ms")
 EXAMPLE = "ros2:///joint_states?command=/effort_controller/commands"
-HIGHEST_DOMAIN = 232
 SPAN = 1e-3, 1e6  # of hz, N m, ms; whatever lies outside is a slip
 
 
@@ -51,7 +50,7 @@ def parse(address: str) -> Ros2Settings:
     if command and not command.startswith("/"):
         raise DriverError(f"'{address}': command={command} is no topic; as in {EXAMPLE}")
     domain = options.get("domain", os.environ.get("ROS_DOMAIN_ID") or "0")
-    if not domain.isdecimal() or int(domain) > HIGHEST_DOMAIN:
+    if not domain.isdecimal() or int(domain) > 232:
         raise DriverError(f"'{address}': domain {domain} is not a number from 0 to 232")
     joints = tuple(x for x in options.get("joints", "").split(",") if x)
     effort = tuple(number_of("effort", x, *SPAN) for x in options.get("effort", "").split(",") if x)

@@ -85,14 +85,13 @@ NAMES = {
         "AutomaticErrorRecovery", "GetRobotModel",
     ),
 }  # fmt: skip
-# Bytes of a request after its header; Move has another size in version 10.
+# Bytes of a request after its header; Move has 113 in version 10.
 SIZES = {
     "Connect": 4, "Move": 56, "StopMove": 0, "GetCartesianLimit": 4, "SetCollisionBehavior": 416,
     "SetJointImpedance": 56, "SetCartesianImpedance": 48, "SetGuidingMode": 7, "SetEEToK": 128,
     "SetNEToEE": 128, "SetLoad": 104, "SetFilters": 40, "AutomaticErrorRecovery": 0,
     "LoadModelLibrary": 2, "GetRobotModel": 0,
 }  # fmt: skip
-MOVE_BYTES_10 = 113
 LIMIT_REPLY = 153  # zero bytes after the status in GetCartesianLimit's reply: no limit is active
 
 
@@ -320,23 +319,19 @@ class RequestReader:
         found = []
         while len(self._held) >= HEADER.size:
             number, ident, size = HEADER.unpack_from(self._held)
-            name = self._name(number, size)
+            names = NAMES[self._version]
+            if number >= len(names):
+                raise BadRequest(f"no command {number} in protocol {self._version}")
+            name = names[number]
+            payload = 113 if name == "Move" and self._version == 10 else SIZES[name]
+            # A client of another version learns of it from the reply to Connect, alike in all.
+            if size != HEADER.size + payload:
+                raise BadRequest(f"{name} of {size} bytes; has: {HEADER.size + payload}")
             if len(self._held) < size:
                 break
             found.append(Request(name, number, ident, bytes(self._held[HEADER.size : size])))
             del self._held[:size]
         return found
-
-    def _name(self, number: int, size: int) -> str:
-        names = NAMES[self._version]
-        if number >= len(names):
-            raise BadRequest(f"no command {number} in protocol {self._version}")
-        name = names[number]
-        payload = MOVE_BYTES_10 if name == "Move" and self._version == 10 else SIZES[name]
-        # A client of another version learns of it from the reply to Connect, which is alike in all.
-        if size != HEADER.size + payload:
-            raise BadRequest(f"{name} of {size} bytes; has: {HEADER.size + payload}")
-        return name
 
 
 def reply(request: Request, status: Status, version: int, rest: bytes = b"") -> bytes:

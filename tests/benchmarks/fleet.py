@@ -27,8 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from adapter.effects.robots import documented, robot_mjcf, robot_urdf
 from adapter.effects.torque import ModelTorque
-from adapter.runs.fleet.engine import here
-from adapter.runs.fleet.fleet import Settings, found_logs, learn_fleet
+from adapter.runs.fleet.fleet import Settings, found_logs, here, learn_fleet
 from adapter.runs.fleet.moments import Task, content_of
 from adapter.signals.validation import smooth
 from drivers.files.mcap import McapWriter, read_log

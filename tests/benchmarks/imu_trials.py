@@ -17,7 +17,7 @@ from adapter.model.spatial import matrix_from_zxz
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import learned_model
 from adapter.runs.replay import ReplayOptions, replay
-from adapter.signals.link_imus import with_link_imus
+from adapter.signals.frame_topics import with_link_imus
 from tests.helpers.arm_data import panda_model
 from tests.helpers.benchmark import options, told
 from tests.helpers.imu_data import Parts, axis_errors, record

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapter.control.feedforward import ModelFeedforward
-from adapter.control.instant import Row
+from adapter.control.feedforward import ModelFeedforward, Row
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE, LEARNED
 from adapter.effects.torque import ModelTorque

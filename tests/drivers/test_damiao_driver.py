@@ -9,8 +9,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from drivers.damiao.arm import DamiaoArm
-from drivers.damiao.speed_check import SpeedCheck
+from drivers.damiao.arm import DamiaoArm, SpeedCheck
 from drivers.damiao.timing import NOTHING, ArrivalClock, at_instant
 from drivers.interface import Driver, DriverError
 from tests.helpers.damiao_tools import LIMITS, Bank, MotorBus, reply_bytes, tick, ticks

@@ -15,7 +15,7 @@ import pytest
 
 from drivers.fci import FciArm, reader_client
 from drivers.fci.codec import id_at
-from drivers.fci.limits import TORQUE_STEP
+from drivers.fci.torque_control import TORQUE_STEP
 from drivers.interface import Driver, DriverError, NotReady
 from tests.helpers import fci_peer
 from tests.helpers.fci_peer import Peer

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.fci.limits import (
+from drivers.fci.torque_control import (
     OWN_COMMANDS,
     SETTLE_TICKS,
     STRANGE_TICKS,

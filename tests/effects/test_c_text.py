@@ -22,7 +22,7 @@ from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
-from sim.fci.model import COMPILER
+from sim.fci.server import COMPILER
 from tests.helpers.robot_models import machine_urdf, read_quietly
 from tests.simulate.test_rollouts import BALL, CASES, SENSED
 

@@ -19,9 +19,7 @@ from adapter.experiments.page.atlas_figures import (
     skeleton,
     whole_panels,
 )
-from adapter.experiments.page.beyond import beyond
-from adapter.experiments.page.figure6 import logarithmic, turns_and_shifts
-from adapter.experiments.page.page import render_experiment
+from adapter.experiments.page.page import beyond, logarithmic, render_experiment, turns_and_shifts
 from adapter.experiments.page.words import headline, scientific, sentences
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.model.tree import Tree

@@ -10,10 +10,10 @@ import pytest
 
 from adapter.gap.changes import Windows, loaded, with_changes
 from adapter.gap.fit import Fit, Model
+from adapter.gap.held_out import moments_of
 from adapter.gap.long_recording import RATE_HZ, LongRecording, Survey, is_long
 from adapter.gap.real_arm import as_driven, nominal_fit, real_arm
 from adapter.gap.signals import KNOT_S, Recorded, Signals, Splines, on_grid
-from adapter.gap.weighed import moments_of
 from adapter.gap.workflow import find_gap
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm

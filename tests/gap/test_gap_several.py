@@ -13,9 +13,8 @@ import pytest
 from adapter.gap import workflow
 from adapter.gap.fit import Fit, Model, place_of
 from adapter.gap.load import hand_frame
-from adapter.gap.several import Several
+from adapter.gap.several import Part, Several, Together
 from adapter.gap.signals import Recorded, prepare
-from adapter.gap.together import Part, Together
 from adapter.gap.workflow import names_of
 from adapter.judgement.priors import theta_prior
 from adapter.physics.rigid_arm import RigidArm

@@ -14,8 +14,7 @@ import pytest
 from adapter.cli import main
 from adapter.errors import ModelError
 from adapter.gap.hand import hand_frame
-from adapter.gap.load import HandLoad, find_load
-from adapter.gap.load_words import as_json, robot_lines, sentence
+from adapter.gap.load import HandLoad, as_json, find_load, robot_lines, sentence
 from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import rot_x

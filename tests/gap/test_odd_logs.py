@@ -16,8 +16,7 @@ from adapter.cli import main
 from adapter.errors import ModelWarning
 from adapter.gap.load import HandLoad, find_load
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.rows import stuck
-from adapter.screening.screen import RecordingRefused, check_torque
+from adapter.screening.screen import RecordingRefused, check_torque, stuck
 from drivers.files.mcap import Log, write_log
 from sim.effects import payload, per_joint
 from tests.helpers.arm_data import Motion, arm, panda_model, record

@@ -18,7 +18,7 @@ from adapter.runs.outcome import Outcome, learned_model
 from adapter.runs.pipeline import Pipeline
 from adapter.runs.replay import ReplayOptions, replay
 from adapter.runs.score import Reference, schema_score
-from adapter.signals.link_imus import with_link_imus
+from adapter.signals.frame_topics import with_link_imus
 from drivers.files.mcap import Log
 from drivers.interface import DriverError
 from tests.helpers.arm_data import panda_model

@@ -9,9 +9,8 @@ import pytest
 
 from adapter.errors import ModelError
 from adapter.experiments.networks import NetworkSettings, schema_by_networks
-from adapter.learning.batch.moments import schema_moments
 from adapter.learning.batch.prediction_errors import kinematic_errors
-from adapter.learning.batch.schema import schema_from_moments
+from adapter.learning.batch.schema import schema_from_moments, schema_moments
 from adapter.learning.schema_kernels import CHANNELS
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import SelfModel

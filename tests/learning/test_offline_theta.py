@@ -10,13 +10,13 @@ import torch
 from scipy.optimize import least_squares
 
 from adapter.errors import ModelError
+from adapter.experiments.falls import smoothed_data
 from adapter.learning.batch.prediction_errors import (
     kinematic_errors,
     predicted_torques,
     relative_errors,
 )
 from adapter.learning.batch.schema import schema_from_moments
-from adapter.learning.batch.smoothing import smoothed_data
 from adapter.learning.batch.theta import branches, learn_theta
 from adapter.learning.batch.theta_factors import row_factors, scales, system
 from adapter.learning.batch.theta_solvers import consistent_theta, least_squares_theta

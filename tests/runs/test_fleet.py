@@ -21,16 +21,18 @@ from adapter.errors import MeansError, SettingsError
 from adapter.model import model_file
 from adapter.physics.identifiability import base_parameters
 from adapter.runs.config import PipelineSettings
-from adapter.runs.fleet import engine
+from adapter.runs.fleet import fleet as fleets
 from adapter.runs.fleet.arm import FleetArm, learn_arm
 from adapter.runs.fleet.course import Drift, Series, StandsOut, courses
-from adapter.runs.fleet.engine import AT_HAND, here, on_cluster
 from adapter.runs.fleet.fleet import (
+    AT_HAND,
     Fleet,
     Settings,
     forget,
     found_logs,
+    here,
     learn_fleet,
+    on_cluster,
     read_manifest,
     recall,
 )
@@ -339,7 +341,7 @@ def test_a_log_that_has_grown_counts_once(logs: Path, tmp_path: Path) -> None:
 
 def test_nobody_answers_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
-    monkeypatch.setattr(engine, "ANSWER_S", 1.0)
+    monkeypatch.setattr(fleets, "ANSWER_S", 1.0)
     with pytest.raises(MeansError, match="no Dask scheduler there"):
         list(on_cluster(moments_of, [Task("x", "")], "tcp://127.0.0.1:1"))
 

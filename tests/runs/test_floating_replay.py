@@ -24,7 +24,7 @@ from adapter.model.urdf import model_from_urdf
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
-from adapter.signals.base_motion import frames_on_base, with_base_motion
+from adapter.signals.frame_topics import frames_on_base, with_base_motion
 from adapter.signals.matching import matching
 from drivers.files.mcap import Log, read_log
 from drivers.files.ros_types import ACCEL_STAMPED, IMU, JOINT_STATE, ODOMETRY, TWIST_STAMPED

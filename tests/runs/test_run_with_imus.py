@@ -18,7 +18,7 @@ from adapter.model.model_file import load_model
 from adapter.realtime.session import run_lockstep
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.replay import replay
-from adapter.signals.link_imus import with_link_imus
+from adapter.signals.frame_topics import with_link_imus
 from adapter.signals.matching import matching
 from drivers.files.mcap import McapWriter, read_log
 from drivers.files.ros_types import IMU

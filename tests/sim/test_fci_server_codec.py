@@ -18,7 +18,7 @@ from sim.fci.codec import (
     read_command,
     reply,
 )
-from sim.fci.model import robot_urdf
+from sim.fci.server import robot_urdf
 from sim.scenarios import build
 
 # Field -> byte offset in version 5 (f64) and in version 10 (f32).

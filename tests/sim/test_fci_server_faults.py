@@ -16,8 +16,7 @@ from sim.faults import Fault, read_fault
 from sim.fci.clock import PERIOD_NS, Ticks
 from sim.fci.codec import ERRORS, Generator, Request, RobotCommand, RobotMode, StateFrame
 from sim.fci.faults import JUMP_RAD, KINDS, Spoiler, add_arguments
-from sim.fci.motion import DesiredMotion
-from sim.fci.robot import RECOVERY_TICKS, Robot
+from sim.fci.robot import RECOVERY_TICKS, DesiredMotion, Robot
 from sim.fci.server import FciServer, run
 from sim.scenarios import build
 from tests.helpers.live_tools import wait_for

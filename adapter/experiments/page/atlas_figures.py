@@ -21,26 +21,8 @@ from adapter.experiments.stated import PAPER_BASELINES
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
+from adapter.report import style
 from adapter.report.skeleton import Skeleton, from_a_corner, skeleton_of
-from adapter.report.style import (
-    ACCENT,
-    GOAL,
-    INK,
-    MUTED,
-    SIZES,
-    STAND_IN,
-    Drawing,
-    Panel,
-    categories,
-    joint_color,
-    legend,
-    log_axis,
-    log_ticks,
-    mark,
-    power_of_ten,
-    thin,
-    time_axis,
-)
 from adapter.runs.outcome import frame_errors
 
 VIEW_DEG = (-28.0, 14.0)  # seen from the front, its right, and above
@@ -115,14 +97,14 @@ def skeleton(tree: Tree, lam: Array) -> Skeleton:
     return skeleton_of(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:], np.zeros(tree.n))
 
 
-def epoch_panels(atlas: AtlasResults) -> list[Panel]:
+def epoch_panels(atlas: AtlasResults) -> list[style.Panel]:
     """λ of each epoch kept, then the actual one (Fig. 4a-e)."""
     tree, actual = atlas.tree, skeleton(atlas.tree, atlas.true_lam)
     panels = []
     for label, lam in atlas.snapshots:
         shown = skeleton(tree, lam)
         off = float(np.linalg.norm(shown.p - actual.p, axis=1).max())
-        drawing = Drawing("third", bare=True, stretch=STRETCH)
+        drawing = style.Drawing("third", bare=True, stretch=STRETCH)
         draw_bones(drawing.axes[0], tree, actual, behind=True)
         draw_bones(drawing.axes[0], tree, shown)
         fit_to(drawing, [shown, actual])
@@ -130,7 +112,7 @@ def epoch_panels(atlas: AtlasResults) -> list[Panel]:
         which = EPOCH_LETTERS.get(label)
         title = f"{label[:1].upper()}{label[1:]}"
         panels.append(drawing.panel(f"({which}) {title}" if which else title, "", note))
-    drawing = Drawing("third", bare=True, stretch=STRETCH)
+    drawing = style.Drawing("third", bare=True, stretch=STRETCH)
     draw_bones(drawing.axes[0], tree, actual)
     fit_to(drawing, [actual])
     return [*panels, drawing.panel(f"(e) Actual {tree.n}-joint robot", "", "true λ")]
@@ -140,14 +122,14 @@ def draw_bones(
     ax: Axes, tree: Tree, shown: Skeleton, behind: bool = False, only: Sequence[int] | None = None
 ) -> None:
     """Lines from each parent's origin to the joint's, and a dot there."""
-    color = {j: joint_color(limb.color) for limb in limbs(tree) for j in limb.joints}
+    color = {j: style.joint_color(limb.color) for limb in limbs(tree) for j in limb.joints}
     for j, line in enumerate(shown.bones(tree)):
         ends = from_a_corner(line, *VIEW_DEG).T
         if behind:
-            ax.plot(*ends, color=MUTED, linewidth=6.0, alpha=0.25, solid_capstyle="round")
+            ax.plot(*ends, color=style.MUTED, linewidth=6.0, alpha=0.25, solid_capstyle="round")
             continue
         marked = only is None or j in only
-        stroke = color[j] if only is None else ACCENT if marked else MUTED
+        stroke = color[j] if only is None else style.ACCENT if marked else style.MUTED
         wide = 2.2 if only is None else 3.4 if marked else 1.6
         faint = 1.0 if marked else 0.55
         ax.plot(*ends, color=stroke, linewidth=wide, alpha=faint, solid_capstyle="round")
@@ -155,15 +137,15 @@ def draw_bones(
         ax.plot(*dot, color=stroke, marker="o", markersize=3.4, alpha=faint, linestyle="none")
     if not behind:
         base = from_a_corner(np.zeros((1, 3)), *VIEW_DEG).T
-        ax.plot(*base, color=INK, marker="s", markersize=4.4)
+        ax.plot(*base, color=style.INK, marker="s", markersize=4.4)
 
 
-def fit_to(drawing: Drawing, shown: Sequence[Skeleton]) -> None:
+def fit_to(drawing: style.Drawing, shown: Sequence[Skeleton]) -> None:
     """Limits that hold everything at equal scales, and how long a metre is."""
     ax = drawing.axes[0]
     flat = from_a_corner(np.vstack([np.zeros((1, 3)), *(x.p for x in shown)]), *VIEW_DEG)
     low, high = flat.min(axis=0), flat.max(axis=0)
-    width, height, text = SIZES[drawing.size]
+    width, height, text = style.SIZES[drawing.size]
     ratio = width / (height * STRETCH)
     half = 0.5 * MARGIN * max(float((high - low)[1]), float((high - low)[0]) / ratio, 1e-6)
     x, y = 0.5 * (low + high)
@@ -172,13 +154,18 @@ def fit_to(drawing: Drawing, shown: Sequence[Skeleton]) -> None:
     fits = [s for s in SCALES_M if s <= SCALE_SHARE * 2.0 * half]
     scale = fits[-1] if fits else SCALES_M[0]
     left, foot = x - 0.97 * ratio * half, y - 0.95 * half
-    ax.plot([left, left + scale], [foot, foot], color=MUTED, linewidth=1.4)
+    ax.plot([left, left + scale], [foot, foot], color=style.MUTED, linewidth=1.4)
     ax.text(
-        left + scale + 0.03 * half, foot, f"{scale:g} m", color=MUTED, va="center", fontsize=text
+        left + scale + 0.03 * half,
+        foot,
+        f"{scale:g} m",
+        color=style.MUTED,
+        va="center",
+        fontsize=text,
     )
 
 
-def histogram_panels(atlas: AtlasResults) -> tuple[Panel, Panel]:
+def histogram_panels(atlas: AtlasResults) -> tuple[style.Panel, style.Panel]:
     """Kinematic errors of the networks' λ (Fig. 4f) and of the moments'."""
     error, edges = "errors |k − k̂|", atlas.error_edges
     on = f"the {grouped(atlas.numbers['learned_samples'])} samples"
@@ -190,15 +177,15 @@ def histogram_panels(atlas: AtlasResults) -> tuple[Panel, Panel]:
     )
 
 
-def _histogram(edges: Array, by_kind: Mapping[str, Array], title: str, note: str) -> Panel:
+def _histogram(edges: Array, by_kind: Mapping[str, Array], title: str, note: str) -> style.Panel:
     """How large the kinematic errors are, by kind; `edges` (bins + 1,) are logarithms."""
     counts = {kind: np.asarray(c, float) for kind, c in by_kind.items() if sum(c) > 0.0}
-    drawing = Drawing("third", stretch=STRETCH)
+    drawing = style.Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
     for k, (kind, values) in enumerate(counts.items()):
         name, unit = KINDS[kind]
         share = PERCENT * values / values.sum()
-        label, color = f"{name} {kind}, {unit}", joint_color(k)
+        label, color = f"{name} {kind}, {unit}", style.joint_color(k)
         ax.stairs(share, 10.0**edges, color=color, fill=True, alpha=0.18)
         ax.stairs(share, 10.0**edges, color=color, linewidth=1.2, label=label)
     # A logarithmic x axis around what is counted, with the goal in it.
@@ -206,46 +193,50 @@ def _histogram(edges: Array, by_kind: Mapping[str, Array], title: str, note: str
     first, last = 10.0 ** (edges[used[0]] - 0.5), 10.0 ** (edges[used[-1] + 1] + 0.5)
     ax.set_xscale("log")
     ax.set_xlim(min(first, 0.25 * KINEMATIC_GOAL), max(last, 4.0 * KINEMATIC_GOAL))
-    log_ticks(ax.xaxis, LogLocator(10, numticks=7), power_of_ten)
+    style.log_ticks(ax.xaxis, LogLocator(10, numticks=7), style.power_of_ten)
     ax.set_ylim(0.0, 1.5 * ax.dataLim.y1)  # room for the legend, which the goal must not cross
     low, high = np.log10(ax.get_xlim())
     side = "right" if np.log10(KINEMATIC_GOAL) < 0.5 * (low + high) else "left"
-    legend(ax, loc=f"upper {side}", ncols=1, handlelength=1.2, borderaxespad=0.1)
-    mark(ax, KINEMATIC_GOAL, "goal", top=0.6)
-    time_axis(drawing, "size of the error, in the unit of its kind")
+    style.legend(ax, loc=f"upper {side}", ncols=1, handlelength=1.2, borderaxespad=0.1)
+    style.mark(ax, KINEMATIC_GOAL, "goal", top=0.6)
+    style.time_axis(drawing, "size of the error, in the unit of its kind")
     most = int(max(values.sum() for values in counts.values()))
     return drawing.panel(title, "% of their kind", f"{note}; {grouped(most)} numbers of a kind")
 
 
-def schema_panels(atlas: AtlasResults) -> list[Panel]:
+def schema_panels(atlas: AtlasResults) -> list[style.Panel]:
     """λ's cost while it is learned, and its error at the epochs of the pictures."""
     cost = atlas.cost
     good = np.isfinite(cost) & (cost > 0.0)
-    drawing = Drawing("third", stretch=STRETCH)
+    drawing = style.Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
-    ax.plot(*thin(np.flatnonzero(good).astype(float), cost[good]), color=ACCENT, linewidth=1.2)
-    log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
+    ax.plot(
+        *style.thin(np.flatnonzero(good).astype(float), cost[good]),
+        color=style.ACCENT,
+        linewidth=1.2,
+    )
+    style.log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
     ax.set_xlim(0.0, 1.04 * len(cost))
-    time_axis(drawing, "step of the optimiser")
+    style.time_axis(drawing, "step of the optimiser")
     panel = drawing.panel("Cost of λ, eq. 18", "m²/s² + rad²/s²", "mean over the joints")
     return [panel, _epoch_errors(atlas)]
 
 
-def _epoch_errors(atlas: AtlasResults) -> Panel:
+def _epoch_errors(atlas: AtlasResults) -> style.Panel:
     """One dot per joint: how far its frame is from the actual one in its parent's."""
     n = atlas.tree.n
     lam = np.stack([lam for _, lam in atlas.snapshots])
     off = np.maximum(frame_errors(lam, atlas.true_lam, Freedom.none(n)), SMALLEST)
-    drawing = Drawing("third", stretch=STRETCH)
+    drawing = style.Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
     at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)
     for k, (name, errors) in enumerate(zip(("turn, rad", "shift, m"), off, strict=True)):
-        side, color = -0.18 + 0.36 * k, (ACCENT, GOAL)[k]
+        side, color = -0.18 + 0.36 * k, (style.ACCENT, style.GOAL)[k]
         dots = (at + side).ravel(), errors.ravel(), "o"
         ax.plot(*dots, markersize=2.6, color=color, alpha=0.75, label=name)
-    log_axis(ax, 0.3 * off.min(), 5.0 * off.max())
-    categories(ax, [label for label, _ in atlas.snapshots])
-    legend(ax, loc="best")
+    style.log_axis(ax, 0.3 * off.min(), 5.0 * off.max())
+    style.categories(ax, [label for label, _ in atlas.snapshots])
+    style.legend(ax, loc="best")
     return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")
 
 
@@ -255,12 +246,12 @@ def arm_rows(atlas: AtlasResults, learner: LearnerScores) -> dict[str, Array]:
     return {k: rows[arm] if len(rows) == whole else rows for k, rows in learner.boxes.items()}
 
 
-def arm_panels(atlas: AtlasResults) -> tuple[list[Panel], list[Panel]]:
+def arm_panels(atlas: AtlasResults) -> tuple[list[style.Panel], list[style.Panel]]:
     """Relative errors of the arm's joints, a panel per learner: the paper's four, then others."""
     known = [x for x in atlas.learners if x.name in PAPER_BASELINES]
     shared = _limits(*(box for x in known for box in arm_rows(atlas, x).values()))
-    paper: list[tuple[str, Panel]] = []
-    others: list[Panel] = []
+    paper: list[tuple[str, style.Panel]] = []
+    others: list[style.Panel] = []
     for learner in atlas.learners:
         rows = arm_rows(atlas, learner)
         which = LETTERS.get(learner.name)
@@ -276,10 +267,10 @@ def arm_panels(atlas: AtlasResults) -> tuple[list[Panel], list[Panel]]:
     return [panel for _, panel in sorted(paper, key=lambda x: x[0])], others
 
 
-def arm_panel(atlas: AtlasResults) -> Panel:
+def arm_panel(atlas: AtlasResults) -> style.Panel:
     """The robot with the joints highlighted that the baselines learn (Fig. 5e)."""
     tree, actual = atlas.tree, skeleton(atlas.tree, atlas.true_lam)
-    drawing = Drawing("half", bare=True, stretch=STRETCH)
+    drawing = style.Drawing("half", bare=True, stretch=STRETCH)
     draw_bones(drawing.axes[0], tree, actual, only=atlas.arm)
     fit_to(drawing, [actual])
     first, last = atlas.arm[0], atlas.arm[-1]
@@ -299,7 +290,7 @@ def not_judged(atlas: AtlasResults) -> list[int]:
     return np.flatnonzero(judged[0] & ~judged[1]).tolist()
 
 
-def whole_panels(atlas: AtlasResults) -> list[Panel]:
+def whole_panels(atlas: AtlasResults) -> list[style.Panel]:
     """FOPnet's relative errors of all joints, in as many panels as they need."""
     ours = atlas.learners[0]
     limits = _limits(*ours.boxes.values())
@@ -315,23 +306,23 @@ def whole_panels(atlas: AtlasResults) -> list[Panel]:
     return panels
 
 
-def side_by_side(atlas: AtlasResults) -> Panel | None:
+def side_by_side(atlas: AtlasResults) -> style.Panel | None:
     """Median and 99th percentile of every learner on one scale; None where no torque was judged."""
     limits = _limits(*([*x.median.values(), *x.p99.values()] for x in atlas.learners))
     if limits is None:
         return None
-    drawing = Drawing("half", stretch=STRETCH)
+    drawing = style.Drawing("half", stretch=STRETCH)
     ax = drawing.axes[0]
     for k, learner in enumerate(atlas.learners):
         for side, name in zip((-0.2, 0.0, 0.2), SETS, strict=True):
             errors = np.array([learner.median[name], learner.p99[name]])
             middle, high = PERCENT * np.maximum(errors, SMALLEST)
-            color = STAND_IN[SET_NAMES[name]]
+            color = style.STAND_IN[SET_NAMES[name]]
             ax.plot([k + side] * 2, [middle, high], color=color, linewidth=2.0, alpha=0.45)
             ax.plot([k + side], [middle], "o", color=color, markersize=4.5)
             ax.plot([k + side], [high], "_", color=color, markersize=7)
-    log_axis(ax, *limits)
-    categories(ax, [x.name for x in atlas.learners])
+    style.log_axis(ax, *limits)
+    style.categories(ax, [x.name for x in atlas.learners])
     note = "dot: median; bar up to the 99th percentile, over all joints that the learner has"
     return drawing.panel("All learners on one scale", "relative error, %", note)
 
@@ -350,22 +341,22 @@ def _limits(*tables: Array | list[float]) -> tuple[float, float] | None:
 
 def _boxes(
     rows: Mapping[str, Array], joints: Sequence[int], limits: tuple[float, float]
-) -> Drawing:
+) -> style.Drawing:
     """Boxes (joints, 5) of each set beside each other, joint by joint."""
-    drawing = Drawing("half")
+    drawing = style.Drawing("half")
     ax = drawing.axes[0]
     width = 0.72 / len(SETS)
-    log_axis(ax, *limits)
+    style.log_axis(ax, *limits)
     for k, name in enumerate(SETS):
         whisker, first, middle, third, end = PERCENT * np.maximum(rows[name], SMALLEST).T
         x = np.arange(len(joints)) + (k - 1.0) * width
-        color = STAND_IN[SET_NAMES[name]]
+        color = style.STAND_IN[SET_NAMES[name]]
         ax.vlines(x, whisker, end, color=color, linewidth=0.9)
         ax.bar(x, third - first, 0.82 * width, first, color=color, alpha=0.4, linewidth=0, zorder=2)
         ax.hlines(middle, x - 0.41 * width, x + 0.41 * width, color=color, linewidth=1.6, zorder=3)
     ax.set_ylim(*limits)
-    categories(ax, [str(int(j) + 1) for j in joints])
+    style.categories(ax, [str(int(j) + 1) for j in joints])
     for before, _ in itertools.pairwise(range(len(joints))):
-        ax.axvline(before + 0.5, color=STAND_IN["grid"], linewidth=0.6, zorder=0)
-    time_axis(drawing, "joint")
+        ax.axvline(before + 0.5, color=style.STAND_IN["grid"], linewidth=0.6, zorder=0)
+    style.time_axis(drawing, "joint")
     return drawing

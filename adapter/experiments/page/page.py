@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from adapter.experiments.falls import SETS
 from adapter.experiments.page import atlas_figures as figures
-from adapter.experiments.page import figure6, words
-from adapter.experiments.page.beyond import beyond
+from adapter.experiments.page import words
 from adapter.experiments.results import AtlasResults, PandaResults, Stated
 from adapter.experiments.stated import PAPER_BASELINES
 from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.numbers import DASH
 from adapter.model.spatial import Array
+from adapter.report import style
 from adapter.report.html import fill
-from adapter.report.style import JOINT_COLORS
+from adapter.report.learned_panels import FIRST_S, GROUPS, rotation_path
 from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW
+from adapter.runs.score import TORQUE_GOAL
 
 BASELINES = (
     "the feed-forward network",
@@ -54,12 +56,12 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
         reasons.append("Fig. 6b: θ was not learned, it waits until λ has converged.")
     learned = None
     if panda is not None:
-        torque, names = figure6.torque_panel(panda), panda.tree.joint_names
+        torque, names = torque_panel(panda), panda.tree.joint_names
         learned = {
-            "joints": [(j % JOINT_COLORS + 1, name) for j, name in enumerate(names)],
-            "lambda": figure6.lambda_panels(panda),
-            "theta": [*figure6.theta_panels(panda), *([torque] if torque else [])],
-            "logarithmic": figure6.logarithmic(panda),
+            "joints": [(j % style.JOINT_COLORS + 1, name) for j, name in enumerate(names)],
+            "lambda": lambda_panels(panda),
+            "theta": [*theta_panels(panda), *([torque] if torque else [])],
+            "logarithmic": logarithmic(panda),
             "stated": stated_table(panda.stated),
         }
     return {
@@ -108,7 +110,9 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
     tuning = [(x.name, x.title.rstrip("."), words.sentences(x.tuning)) for x in atlas.learners]
     return {
         "n": atlas.tree.n,
-        "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figures.limbs(atlas.tree)],
+        "limbs": [
+            (limb.color % style.JOINT_COLORS + 1, limb.name) for limb in figures.limbs(atlas.tree)
+        ],
         "schema": [*figures.epoch_panels(atlas), histogram],
         "schema_more": [moments, *figures.schema_panels(atlas)],
         "not_converged": _not_converged(atlas),
@@ -203,3 +207,230 @@ def _spread(values: Array) -> str:
         return DASH
     low, high = words.scientific(float(finite.min())), words.scientific(float(finite.max()))
     return low if low == high else f"{low}{NARROW}–{JOIN}{NARROW}{high}"
+
+
+SECONDS = "seconds of motion learned from"
+Line = tuple[str, Array, str]  # name, values, colour
+
+
+def beyond(atlas: AtlasResults | None, panda: PandaResults | None) -> dict[str, Any] | None:
+    """Tables and panels of the section; None where neither was run."""
+    robots = [
+        (name, results.numbers["discover"])
+        for name, results in (("ATLAS", atlas), ("Panda", panda))
+        if results is not None and results.numbers["discover"]["trials"]
+    ]
+    online = {} if atlas is None else atlas.numbers["online"]
+    if not robots and not online:
+        return None
+    return {
+        "trees": tree_table(robots),
+        "online": online_table(online),
+        "panels": online_panels(online.get("history", [])),
+    }
+
+
+def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
+    """Of each robot how many trees were found, and how sure of them discovery was."""
+    if not robots:
+        return None
+    trials = [found for _, found in robots]
+    wrong = [found["most_confidence_wrong"] for found in trials]
+    rows: list[tuple[str, list[str]]] = [
+        ("trees found, every edge right", [f"{x['right']} of {x['trials']}" for x in trials]),
+        ("least confidence in a right edge", [_share(x["least_confidence_right"]) for x in trials]),
+        (
+            "most confidence in a wrong edge",
+            [_share(x) if x > 0.0 else "none was reported" for x in wrong],
+        ),
+        ("longest recording", [words.with_unit(x["motion_s"], "s", 3) for x in trials]),
+        (
+            "measured on every link",
+            [
+                listed([figures.KINDS[kind][0] for kind in x["measured"].split(", ")])
+                for x in trials
+            ],
+        ),
+    ]
+    return Table(["", *(name for name, _ in robots)], [[what, *cells] for what, cells in rows])
+
+
+def _share(confidence: float) -> str:
+    """Never rounded up to certainty."""
+    return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
+
+
+def online_table(online: Mapping[str, Any]) -> Table | None:
+    """How fast the online learner is on the whole tree, and what it shows; None without any."""
+    if not online:
+        return None
+    settled_s = online["lambda_settled_s"]
+    settled = "not reached" if settled_s is None else words.with_unit(settled_s, "s", 3)
+    steps = [
+        words.with_unit(1e-3 * us, "ms", 3) if us >= 1e3 else words.with_unit(us, "µs", 3)
+        for us in (online["step_p50_us"], online["step_p99_us"])
+    ]
+    rows = [
+        ["samples a second, on one core", words.with_unit(online["samples_per_second"], "1/s", 3)],
+        ["time of a sample, median", steps[0]],
+        ["time of a sample, 99th percentile", steps[1]],
+        ["λ settled, θ begins after", settled],
+        ["directions of λ shown", f"{online['lambda_rank']} of {6 * online['joints']}"],
+    ]
+    return Table(["", "ATLAS"], rows)
+
+
+def online_panels(history: Sequence[Mapping[str, float]]) -> list[style.Panel]:
+    """Torque error over least squares', and λ's error, against seconds learned from."""
+    if not history:
+        return []
+    over = {key: np.array([row[key] for row in history]) for key in history[0]}
+    t = over["seconds"]
+    ratios: list[Line] = [
+        ("all joints", over["over_least_squares"], style.ACCENT),
+        ("worst joint", over["worst_joint_over_least_squares"], style.MUTED),
+    ]
+    errors: list[Line] = [
+        ("turn, rad", over["turn_rad"], style.ACCENT),
+        ("shift, m", over["shift_m"], style.GOAL),
+    ]
+    note = "on a motion never learned from; 1 is least squares on all samples seen so far"
+    return [
+        _plot(t, ratios, TORQUE_GOAL).panel(
+            "ATLAS online: torque error", "times batch least squares", note
+        ),
+        _plot(t, errors, None).panel(
+            "ATLAS online: error of λ", "rad, m", "of the joint whose frame is farthest off"
+        ),
+    ]
+
+
+def _plot(t: Array, lines: Sequence[Line], goal: float | None) -> style.Drawing:
+    """Lines with a dot at each look, from zero on."""
+    drawing = style.Drawing("half")
+    ax = drawing.axes[0]
+    shown = np.concatenate([values for _, values, _ in lines])
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    for name, values, color in lines:
+        ax.plot(t, values, color=color, linewidth=1.2, marker="o", markersize=2.8, label=name)
+    if len(shown):
+        low, high = float(shown.min()), max(float(shown.max()), goal or 0.0)
+        if goal is None or high > 10.0 * low:  # less is plotted linearly
+            style.log_axis(ax, 0.5 * min(low, goal or low), 4.0 * high)
+        else:
+            ax.set_ylim(0.0, 1.35 * high)
+    ax.set_xlim(0.0, 1.04 * float(t[-1]))
+    if goal is not None:
+        style.level(ax, goal, f"goal {words.scientific(goal)}", left=True)
+    style.legend(ax, fontsize=style.SIZES["half"][2], loc="upper right", ncols=2)
+    style.time_axis(drawing, SECONDS)
+    return drawing
+
+
+TITLES = (
+    ("(a) λ: orientation of the joint frames", "rad", slice(0, 3)),
+    ("(a) λ: position of the joint frames", "m", slice(3, 6)),
+)
+
+
+def lambda_panels(panda: PandaResults) -> list[style.Panel]:
+    """One line per turn and shift of every joint frame (Fig. 6a), the true values dashed."""
+    t, lam = _some(panda, panda.time_s, panda.lam)
+    if len(t) < 2:
+        return []
+    path, true = turns_and_shifts(lam, panda.lam_true)
+    panels = []
+    for title, unit, part in TITLES:
+        drawing = style.Drawing("half")
+        ax = drawing.axes[0]
+        for j in range(panda.tree.n):
+            for k in range(part.start, part.stop):
+                shown = bool(panda.lam_shown[j, k])
+                width, alpha = (1.2, 1.0) if shown else (0.7, 0.45)
+                ax.plot(t, path[:, j, k], color=style.joint_color(j), linewidth=width, alpha=alpha)
+                if shown:
+                    ax.axhline(true[j, k], color=style.INK, linewidth=0.6, linestyle=(0, (4, 3)))
+        _finish(drawing, t, panda)
+        what = "rotation vectors" if unit == "rad" else "origins"
+        panels.append(drawing.panel(title, unit, f"{what}, x, y and z in the parent's axes"))
+    return panels
+
+
+def theta_panels(panda: PandaResults) -> list[style.Panel]:
+    """One line per inertial parameter of every link (Fig. 6b), by kind."""
+    t, theta = _some(panda, panda.theta_time_s, panda.theta)
+    if len(t) < 2:
+        return []
+    panels, titles = [], ("mass", "first moments mX mY mZ", "inertia XX to ZZ")
+    for title, (unit, parts) in zip(titles, GROUPS, strict=True):
+        drawing = style.Drawing("half")
+        for j in range(panda.tree.n):
+            drawing.axes[0].plot(t, theta[:, j, parts], color=style.joint_color(j), linewidth=1.0)
+        _finish(drawing, t, panda)
+        panels.append(drawing.panel(f"(b) θ: {title}", unit))
+    return panels
+
+
+def torque_panel(panda: PandaResults) -> style.Panel | None:
+    """Torque error over that of batch least squares; None where θ was not learned."""
+    t, ratio = np.asarray(panda.torque_time_s, float), np.asarray(panda.torque_error, float)
+    good = np.isfinite(ratio) & (ratio > 0.0) & (t >= _first(panda))
+    t, ratio = t[good], ratio[good]
+    if len(t) < 2:
+        return None
+    drawing = style.Drawing("half")
+    ax = drawing.axes[0]
+    ax.plot(*style.thin(t, ratio), color=style.ACCENT, linewidth=1.3)
+    low, high = float(ratio.min()), float(ratio.max())
+    if high > 10.0 * low:
+        style.log_axis(ax, 0.7 * min(low, 1.0), 1.5 * high)
+    else:
+        ax.set_ylim(0.0, 1.15 * max(high, TORQUE_GOAL))
+    _finish(drawing, t, panda)
+    style.level(ax, TORQUE_GOAL, f"goal {TORQUE_GOAL:g}", left=False)
+    note = "of each sample before it was learned from; 1 is least squares on all samples"
+    return drawing.panel("Torque error while learning", "times batch least squares", note)
+
+
+def logarithmic(panda: PandaResults) -> bool:
+    """Whether time is drawn logarithmic: what there is to see comes early."""
+    return not panda.theta_start_s > 0.2 * float(panda.time_s[-1])
+
+
+def _first(panda: PandaResults) -> float:
+    """The earliest time that is drawn, s."""
+    return FIRST_S if logarithmic(panda) else 0.0
+
+
+def _some(panda: PandaResults, t: Array, rows: Array) -> tuple[Array, Array]:
+    """At most about `MOST_POINTS` finite rows, evenly over the time axis."""
+    t, rows = np.asarray(t, float), np.asarray(rows, float)
+    good = np.isfinite(rows).reshape(len(rows), -1).all(axis=1) & (t >= _first(panda))
+    t, rows = t[good], rows[good]
+    if len(t) <= style.MOST_POINTS:
+        return t, rows
+    space = np.geomspace if logarithmic(panda) else np.linspace
+    keep = np.unique(np.searchsorted(t, space(t[0], t[-1], style.MOST_POINTS)).clip(0, len(t) - 1))
+    return t[keep], rows[keep]
+
+
+def turns_and_shifts(lam: Array, true: Array) -> tuple[Array, Array]:
+    """(k, n, 6) rotation vectors and origins over time, and the true ones (n, 6), of the two
+    rotation vectors that mean the same turn the one nearer to what was learned."""
+    both = np.concatenate([lam, true[None]])
+    path = np.concatenate([rotation_path(both), both[..., 3:]], axis=-1)
+    return path[:-1], path[-1]
+
+
+def _finish(drawing: style.Drawing, t: Array, panda: PandaResults) -> None:
+    ax: Axes = drawing.axes[0]
+    if ax.get_yscale() == "linear":
+        low, high = ax.get_ylim()
+        ax.set_ylim(low, high + 0.08 * (high - low))  # room for the words of the mark
+    last = max(float(panda.time_s[-1]), float(t[-1]))
+    if logarithmic(panda):
+        style.log_time(ax, FIRST_S, last)
+    else:
+        ax.set_xlim(0.0, last)
+    style.mark(ax, panda.theta_start_s, "θ starts")
+    style.time_axis(drawing)

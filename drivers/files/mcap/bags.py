@@ -38,7 +38,6 @@ from drivers.files.ros_types import FRANKA_STATE, JOINT_STATE
 from drivers.interface import DriverError
 
 _SQLITE, _ROS1, _ZSTD = b"SQLite format 3\0", b"#ROSBAG", b"\x28\xb5\x2f\xfd"
-_LZ4 = b"\x04\x22\x4d\x18"
 _PACKED: dict[bytes, Callable[[Any], Any]] = {
     _ZSTD: lambda file: zstandard.ZstdDecompressor().stream_reader(file),
     b"\x1f\x8b": lambda file: gzip.GzipFile(fileobj=file),
@@ -336,7 +335,7 @@ def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
         def unpack(data: bytes) -> bytes:  # records never begin like what packs them
             if data.startswith(b"BZh"):
                 content = growth.all_of(bz2.BZ2File(BytesIO(data)))
-            elif data.startswith(_LZ4):
+            elif data.startswith(b"\x04\x22\x4d\x18"):  # LZ4
                 frame = importlib.import_module("lz4.frame")
                 content = growth.all_of(frame.LZ4FrameFile(BytesIO(data)))
             else:

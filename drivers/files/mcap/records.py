@@ -53,7 +53,6 @@ _MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
 MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the index, of its offsets, crc
-_CRC_SIZE = 4
 _LENGTH = struct.Struct("<Q")
 _NOTED: dict[
     int, Any
@@ -284,7 +283,9 @@ class McapScan(Scan):
         at = len(MAGIC)
         while True:
             self._give_back(at)
-            bound = self._next_chunk(at)
+            # of the next chunk, as far as the index knows it
+            place = bisect.bisect_right(self._chunks, at)
+            bound = self._chunks[place] if place < len(self._chunks) else self.size
             found = walk(self._data[:bound], at, _IN_FILE, _TOGETHER)
             yield from self._use(found, self._data)
             at = found.end
@@ -324,11 +325,6 @@ class McapScan(Scan):
             mapped.madvise(mmap.MADV_DONTNEED, self._given_back, whole - self._given_back)
             self._given_back = whole
 
-    def _next_chunk(self, at: int) -> int:
-        """Where the next chunk behind `at` begins, as far as the index knows, else the end."""
-        place = bisect.bisect_right(self._chunks, at)
-        return self._chunks[place] if place < len(self._chunks) else self.size
-
     def _read_index(self) -> None:
         """Channels and places of chunks from a sound index, of use where the data are damaged."""
         end = self.size - len(MAGIC)
@@ -338,7 +334,7 @@ class McapScan(Scan):
         opcode, _, start, _, crc = _FOOTER.unpack_from(self._data, footer)
         if opcode != Opcode.FOOTER or not len(MAGIC) <= start <= footer:
             return
-        if crc and zlib.crc32(self._data[start : end - _CRC_SIZE]) != crc:
+        if crc and zlib.crc32(self._data[start : end - 4]) != crc:
             return
         for opcode, first, last in walk(self._data[:footer], start, _IN_CHUNK).others:
             if opcode not in (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT):
@@ -374,7 +370,12 @@ class McapScan(Scan):
         cut = stop > self.size
         try:
             chunk = self._chunk_at(at)
-            self._spend(chunk.uncompressed_size)
+            size = chunk.uncompressed_size
+            if size > CHUNK_LIMIT:
+                raise DamagedChunk(f"it claims {size} bytes, at most {CHUNK_LIMIT} are read")
+            if self._made + size > GROWTH_LIMIT * self.stored + CHUNK_LIMIT:
+                raise DamagedChunk(f"the file would grow more than {GROWTH_LIMIT} times")
+            self._made += size
             content = decompress(chunk, cut)
             found = walk(content, 0, _IN_CHUNK)
             if not cut and found.end != len(content):
@@ -386,14 +387,6 @@ class McapScan(Scan):
             return
         self._rescued = len(found.start) if cut else 0
         yield from self._use(found, content)
-
-    def _spend(self, size: int) -> None:
-        """Count what chunks make. Raises DamagedChunk where no recording makes so much."""
-        if size > CHUNK_LIMIT:
-            raise DamagedChunk(f"it claims {size} bytes, at most {CHUNK_LIMIT} are read")
-        if self._made + size > GROWTH_LIMIT * self.stored + CHUNK_LIMIT:
-            raise DamagedChunk(f"the file would grow more than {GROWTH_LIMIT} times")
-        self._made += size
 
     def _chunk_at(self, at: int) -> Chunk:
         """The chunk there, whose bytes are not copied; of a cut one as many as there are."""

@@ -12,49 +12,24 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
+from drivers.files import ros, ros_types
 from drivers.files.mcap.records import Region, Scan
-from drivers.files.ros import (
-    IMU_DOUBLES,
-    ODOMETRY_DOUBLES,
-    Block,
-    Bytes,
-    Layout,
-    decode_many,
-    parse_controller_state,
-    parse_doubles,
-    parse_dynamic_joint_state,
-    parse_franka_robot_state,
-    parse_franka_state,
-    parse_joint_state,
-)
-from drivers.files.ros_types import (
-    ACCEL_STAMPED,
-    DYNAMIC_JOINT_STATE,
-    FRANKA_ROBOT_STATE,
-    FRANKA_STATE,
-    IMU,
-    JOINT_JOG,
-    JOINT_STATE,
-    JOINT_TRAJECTORY_CONTROLLER_STATE,
-    ODOMETRY,
-    TWIST_STAMPED,
-)
 from drivers.interface import DriverError
 
-_JOINT_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
-    JOINT_STATE: parse_joint_state,
-    DYNAMIC_JOINT_STATE: parse_dynamic_joint_state,
-    JOINT_TRAJECTORY_CONTROLLER_STATE: parse_controller_state,
-    FRANKA_ROBOT_STATE: parse_franka_robot_state,
-    FRANKA_STATE: parse_franka_state,
+_JOINT_PARSERS: dict[str, Callable[[ros.Bytes], ros.Layout]] = {
+    ros_types.JOINT_STATE: ros.parse_joint_state,
+    ros_types.DYNAMIC_JOINT_STATE: ros.parse_dynamic_joint_state,
+    ros_types.JOINT_TRAJECTORY_CONTROLLER_STATE: ros.parse_controller_state,
+    ros_types.FRANKA_ROBOT_STATE: ros.parse_franka_robot_state,
+    ros_types.FRANKA_STATE: ros.parse_franka_state,
 }
 JOINT_SCHEMAS = tuple(_JOINT_PARSERS)  # messages with positions, velocities and efforts of joints
-PARSERS: dict[str, Callable[[Bytes], Layout]] = {
+PARSERS: dict[str, Callable[[ros.Bytes], ros.Layout]] = {
     **_JOINT_PARSERS,
-    TWIST_STAMPED: partial(parse_doubles, number=6),
-    ACCEL_STAMPED: partial(parse_doubles, number=6),
-    IMU: partial(parse_doubles, number=IMU_DOUBLES),
-    ODOMETRY: partial(parse_doubles, number=ODOMETRY_DOUBLES, of_child=True),
+    ros_types.TWIST_STAMPED: partial(ros.parse_doubles, number=6),
+    ros_types.ACCEL_STAMPED: partial(ros.parse_doubles, number=6),
+    ros_types.IMU: partial(ros.parse_doubles, number=ros.IMU_DOUBLES),
+    ros_types.ODOMETRY: partial(ros.parse_doubles, number=ros.ODOMETRY_DOUBLES, of_child=True),
 }
 
 
@@ -75,7 +50,7 @@ class Series:
     schema: str
     encoding: str
     count: int = 0
-    blocks: list[Block] = field(default_factory=list)
+    blocks: list[ros.Block] = field(default_factory=list)
     kinds: set[tuple[tuple[str, ...], tuple[int, ...]]] = field(default_factory=set)
     bad: list[tuple[int, str]] = field(default_factory=list)
 
@@ -86,7 +61,7 @@ class Series:
         for size in np.unique(sizes):
             here = np.flatnonzero(sizes == size)
             rows = region.rows(region.start[which[here]], int(size))
-            blocks, bad = decode_many(rows, parse)
+            blocks, bad = ros.decode_many(rows, parse)
             for block in blocks:
                 places = here[block.index]
                 index, log_ns = self.count + places, times[which[places]]
@@ -108,7 +83,7 @@ class Series:
         return replace(self, blocks=blocks, count=sum(len(b.index) for b in blocks), bad=[])
 
 
-def in_order(blocks: Sequence[Block], of: Callable[[Block], NDArray]) -> NDArray:
+def in_order(blocks: Sequence[ros.Block], of: Callable[[ros.Block], NDArray]) -> NDArray:
     """What each block has of its messages, in one array in the order of the file."""
     joined = np.concatenate([of(block) for block in blocks])
     if all(a.index[-1] < b.index[0] for a, b in pairwise(blocks)):
@@ -177,7 +152,7 @@ def collect(
     for topic, count in scan.passed.items():
         topics[topic].count += count
     for series in topics.values():
-        if series.schema == JOINT_JOG and series.count:
+        if series.schema == ros_types.JOINT_JOG and series.count:
             scan.warnings.append(
                 f"{scan.path}: {series.topic} jogs: steps and speeds from wherever a joint is tell "
                 "which joints were asked to move, and not where to; record the positions that are "

@@ -38,7 +38,6 @@ JOINT_COMMANDS = "/joint_commands"
 EXTERNAL_TORQUES = "/external_torques"
 LINK_TWISTS = "/link_twists/"
 LINK_ACCELS = "/link_accels/"
-LINK_IMUS = "/link_imus/"
 ESTIMATES = "/estimates"
 METADATA = "panda_adapter"  # name of the metadata record with our own settings
 LIBRARY = "panda-adapter"
@@ -165,7 +164,7 @@ class McapWriter:
         if np.isnan(links.twist[:, :3]).all() and np.isnan(links.accel[:, 3:]).all():
             for i in np.flatnonzero(heard):
                 told = np.concatenate([links.twist[i, 3:], links.accel[i, :3]])
-                channel = self._channel(LINK_IMUS + self.link_names[i], IMU)
+                channel = self._channel(f"/link_imus/{self.link_names[i]}", IMU)
                 self._add(channel, stamp_ns, self._imus[i].encode(stamp_ns, told))
             return
         for (name, encoder), twist, accel in zip(
