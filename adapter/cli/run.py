@@ -31,6 +31,7 @@ from adapter.control.free_path import ArmInCell, Draw, FreeMotion
 from adapter.control.information import Information
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.observer import ContactObserver
+from adapter.control.path_motion import PathMotion
 from adapter.control.played import Player
 from adapter.control.resting import CarriedWeight
 from adapter.control.settings import DESIGNED, gentle
@@ -234,7 +235,7 @@ def controller_of(
         forward = LearnedFeedforward(robot.tree, gravity, effects, tool, known, bound)
     control = ControlSettings(safety=config.safety)
     limits = MotionLimits.of(robot)
-    draw: Callable[..., Any] = plan.draw()
+    draw: Callable[..., PathMotion] = plan.draw()
     if plan.maybe_real:
         draw = free = plan.free_motion()
         free.arm.meanwhile = reading(driver)
