@@ -41,6 +41,8 @@ def test_goes_on_from_a_log_and_writes_the_motion_three_times(tmp_path, capsys):
     np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], dq[1:-1], atol=0.03)
     assert np.diff(t) == pytest.approx(0.01)
     assert (q >= LIMITS.lower).all() and (q <= LIMITS.upper).all()
+    played = ["plan", "--motion", str(tmp_path / "motion.csv"), "--out", str(tmp_path / "plan")]
+    assert main(played) == 0 and "This moves 7 joints" in capsys.readouterr().out
     assert np.abs(dq[[0, -1]]).max() == 0.0 and np.abs(dq).max() > 0.5
     figures = json.loads((tmp_path / "e.json").read_text())
     assert t[-1] == pytest.approx(figures["seconds"] + 1.0, abs=0.05)

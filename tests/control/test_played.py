@@ -39,8 +39,7 @@ def moved(rad: float, start: float = 0.05) -> Player:
 def test_keeps_every_limit_wherever_it_stops(seed: int, slow_s: float) -> None:
     rng = np.random.default_rng(seed)
     settings = ExcitationSettings(slow_s=slow_s, share=rng.uniform(0.3, 0.9))
-    start = READY + rng.uniform(-0.1, 0.1, 7)
-    motion = moved(rng.uniform(0.1, 0.8))(LIMITS, start, settings)
+    motion = moved(rng.uniform(0.1, 0.8))(LIMITS, READY + rng.uniform(-0.1, 0.1, 7), settings)
     lower, upper, speed, acceleration, jerk = motion.bounds()
     q, dq, ddq = played(motion, rng.uniform(0.0, 14.0), 1e-3)
     assert (q >= lower - 1e-9).all() and (q <= upper + 1e-9).all()
@@ -60,8 +59,7 @@ def test_goes_through_the_points_of_the_file_at_its_pace() -> None:
     motion = player(LIMITS, READY, USUAL)
     for t, q in zip(player.t[::20], player.q[::20], strict=True):
         assert np.allclose(motion.path(APPROACH_S + t)[0], q, atol=1e-9)
-    seconds = player.seconds(LIMITS, USUAL)
-    q, dq, _ = played(motion, seconds, 1e-3)
+    q, dq, _ = played(motion, player.seconds(LIMITS, USUAL), 1e-3)
     assert np.allclose(q[-1], player.q[-1], atol=1e-9) and not dq[-1].any()
 
 
@@ -107,7 +105,6 @@ def test_a_motion_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
         (path := tmp_path / f"{name}.csv").write_text(text)
         with pytest.raises(DriverError, match=name):
             read_motion(path, NAMES)
-    with McapWriter(tmp_path / "other.mcap", NAMES):
-        pass
+    McapWriter(tmp_path / "other.mcap", NAMES).close()
     with pytest.raises(DriverError, match="has no trajectory_msgs"):
         read_motion(tmp_path / "other.mcap", NAMES)

@@ -20,6 +20,7 @@ NOT_GIVEN = {
     "can://can0": "a real CAN bus; a simulated one is in simulated-hardware.md",
     "adapter sim fci --": "its options: tests/sim",
     "adapter excite": "minutes of search; tests/cli/test_excite.py gives it with a nearer goal",
+    "--motion runs/motion": "what that wrote; tests/cli/test_excite.py and test_played.py play one",
     "write_a_driver.py": "given by tests/drivers/test_own_driver.py",
     "so101": "of a data set that tests/docs/test_servo_hour.py makes",
     "adapter completion": "given by tests/cli/test_clumsy.py",
