@@ -69,10 +69,7 @@ class PlayedMotion(PathMotion):
 
     def bounds(self) -> tuple[Array, Array, Array, Array, Array]:
         """See the base class."""
-        lower, upper, speed, acceleration, jerk = self._path_bounds
-        ramps = ramp_pairs(self.settings) @ np.array([acceleration, speed])
-        most = ramped(speed, acceleration, jerk, self.settings)[2]
-        return lower, upper, speed, ramps.max(axis=0), most
+        return _with_ramps(self._path_bounds, self.settings)
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ class Player:
         """
         q0, on = np.array(q0, dtype=np.float64), moving(limits, settings).astype(bool)
         lower, upper = usable_range(limits, q0, settings)
-        low, high = (np.where(on, edge, q0) for edge in self._range)
+        low, high = (np.where(on, edge, q0) for edge in self._reach[:2])
         beyond = (low < np.minimum(lower, q0)) | (high > np.maximum(upper, q0))
         if beyond.any():
             j = int(np.argmax(beyond))
@@ -117,7 +114,7 @@ class Player:
         way = np.abs(spline(0.0) - q0)
         rates = [
             np.maximum(on * most * pace**k, way * STEP[k - 1] / APPROACH_S**k)
-            for k, most in enumerate(self._rates, 1)
+            for k, most in enumerate(self._reach[2:], 1)
         ]
         motion = PlayedMotion(q0, spline, pace, (*ends, *rates), settings)
         if not _kept(limits, settings, motion.bounds()).all():
@@ -135,10 +132,8 @@ class Player:
         """
 
         def kept(factor: Array) -> Array:
-            speed, acceleration, jerk = (f * factor**k for k, f in enumerate(self._rates, 1))
-            ramps = ramp_pairs(settings) @ np.array([acceleration, speed])
-            most = ramped(speed, acceleration, jerk, settings)[2]
-            return _kept(limits, settings, (*self._range, speed, ramps.max(axis=0), most))
+            rates = (most * factor**k for k, most in enumerate(self._reach[2:], 1))
+            return _kept(limits, settings, _with_ramps((*self._reach[:2], *rates), settings))
 
         pace = float(largest(np.ones(self.q.shape[1]), kept).min())
         if pace < LEAST_PACE * settings.share:
@@ -159,20 +154,21 @@ class Player:
         return make_interp_spline(self.t, self.q, k=5, bc_type=(rest, rest))
 
     @cached_property
-    def _looks(self) -> Array:
-        """(k,) s: where the spline is looked at, the points and some between two of them."""
+    def _reach(self) -> tuple[Array, ...]:
+        """Lowest, highest q, highest |q'|, |q''|, |q'''| at the points and between, (n,) each."""
         between = np.arange(LOOKS) / LOOKS
-        return np.append((self.t[:-1, None] + np.diff(self.t)[:, None] * between), self.t[-1])
+        looks = np.append(self.t[:-1, None] + np.diff(self.t)[:, None] * between, self.t[-1])
+        q, *rates = (self._spline(looks, k) for k in range(4))
+        return q.min(axis=0), q.max(axis=0), *(np.abs(x).max(axis=0) for x in rates)
 
-    @cached_property
-    def _range(self) -> tuple[Array, Array]:
-        q = self._spline(self._looks)
-        return q.min(axis=0), q.max(axis=0)
 
-    @cached_property
-    def _rates(self) -> list[Array]:
-        """Highest |q'|, |q''|, |q'''|, (n,) each."""
-        return [np.abs(self._spline(self._looks, k)).max(axis=0) for k in (1, 2, 3)]
+def _with_ramps(
+    path_bounds: tuple[Array, ...], settings: ExcitationSettings
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Bounds of the motion on a path with these, while its rate changes, too."""
+    lower, upper, speed, acceleration, jerk = path_bounds
+    ramps = ramp_pairs(settings) @ np.array([acceleration, speed])
+    return lower, upper, speed, ramps.max(axis=0), ramped(speed, acceleration, jerk, settings)[2]
 
 
 def _kept(limits: MotionLimits, settings: ExcitationSettings, bounds: tuple[Array, ...]) -> Array:
