@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from adapter.judgement.noise import LEAST_NM, MEMORY_S, memory_s
+from adapter.judgement.noise import LEAST_NM, USUAL_S, memory_s
 from adapter.model.spatial import Array
 
 
@@ -123,12 +123,12 @@ class Moments(Normal):
     """What is known of a fit's coefficients by a whole recording, by products alone.
 
     Attributes:
-        folds: (f, c, c), (f, c), (f,): products of the white signatures with one
-            another and with the data, and of the data, by blocks of time.
+        folds: (f, c, c), (f, c): products of the white signatures with one another and with the
+            data, by blocks of time.
         seconds: (c, c) products of the gradients of single seconds with one another.
     """
 
-    def __init__(self, folds: tuple[Array, Array, Array], prior_std: Array, seconds: Array) -> None:
+    def __init__(self, folds: tuple[Array, Array], prior_std: Array, seconds: Array) -> None:
         self.folds, self.seconds = folds, seconds
         super().__init__(folds[0].sum(axis=0), folds[1].sum(axis=0), prior_std)
 
@@ -166,16 +166,22 @@ def noise_of(residual: Array, weight: Array | None = None) -> Noise:
     left = residual * weight
     rows = np.maximum(np.sum(weight**2, axis=0), 1.0)
     level = np.sqrt(np.sum(left**2, axis=0) / rows + LEAST_NM**2)
-    return Noise(level, BAND_HZ * memory_s(left, 1.0 / BAND_HZ))
+    return Noise(level, BAND_HZ * memory_s(left, 1.0 / BAND_HZ, rows))
 
 
-def quiet_noise(residual: Array) -> Noise:
+def quiet_noise(residual: Array, weight: Array) -> Noise:
     """Noise of a residual (k, n), N m, as it is in most windows of it, about their means.
+
+    Rows count as `weight` (k, n), windows as often as rows of them do.
 
     What happens but once, a contact or a load that is picked up, is no noise then, and what comes
     in at some time and stays is none.
     """
     k = max(len(residual) // 50, 1)  # samples, 2 s
-    windows = residual[: k * (len(residual) // k)].reshape(k, -1, residual.shape[1])
-    level = np.sqrt(np.median(windows.var(axis=1), axis=0) + LEAST_NM**2)
-    return Noise(level, np.full(len(level), BAND_HZ * MEMORY_S[0]))
+    left, rows = (x[: k * (len(x) // k)].reshape(k, -1, x.shape[1]) for x in (residual, weight**2))
+    count = np.maximum(rows.sum(axis=1), 1e-9)
+    mean = np.sum(rows * left, axis=1) / count
+    spread = np.sum(rows * (left - mean[:, None]) ** 2, axis=1) / count
+    middle = np.quantile(spread, 0.5, axis=0, weights=count, method="inverted_cdf")
+    level = np.sqrt(middle + LEAST_NM**2)
+    return Noise(level, np.full(len(level), BAND_HZ * USUAL_S))

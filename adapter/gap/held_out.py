@@ -59,7 +59,7 @@ def held_out_models(
 ) -> list[list[SelfModel]]:
     """Of each recording one model per fold: refitted without that fold's blocks of time."""
     models: list[list[SelfModel]] = [[] for _ in fit.recordings]
-    for known in Folds.of(fit, carried).known():
+    for known in Folds.of(fit, carried).known:
         try:
             own = [model_of(model, possible(fit.at(known.x), known), i) for i in range(len(models))]
         except ModelError:  # a coefficient at its bound without these data
@@ -436,7 +436,7 @@ def _curves(name: str, found: Found, i: int) -> Curves:
     own, model = found.fit.recordings[i], found.fit.model
     nominal = Model((own,), np.zeros_like(found.fit.dtheta), known=model.known)
     after = np.empty_like(own.tau)
-    for f, known in enumerate(Folds.of(found.fit, found.carried).known()):
+    for f, known in enumerate(Folds.of(found.fit, found.carried).known):
         rows = fold_of(own.t, block_s(found.fit)) == f
         fit = found.fit.at(known.x)
         named = fit.with_named([e for e in fit.named if not e.is_pattern])
@@ -471,8 +471,8 @@ def moments_of(fit: Fit, whole: LongRecording) -> Moments:
         fit: of one recording, its noise being that of all.
     """
     c, n = len(fit.coefficients), fit.n
-    G, g, power = np.zeros((FOLDS, c, c)), np.zeros((FOLDS, c)), np.zeros(FOLDS)
-    seconds, block = np.zeros((c, c)), block_s(fit)
+    G, g, seconds = np.zeros((FOLDS, c, c)), np.zeros((FOLDS, c)), np.zeros((c, c))
+    block = block_s(fit)
     for part in pieces_of(fit, whole):
         N, left = part.whiten([part.model.signatures(0)]), part.whiten(part.model.residuals())
         data = left + fit.coefficients @ N
@@ -481,10 +481,9 @@ def moments_of(fit: Fit, whole: LongRecording) -> Moments:
             own = N[:, fold == f]
             G[f] += own @ own.T
             g[f] += own @ data[fold == f]
-            power[f] += float(data[fold == f] @ data[fold == f])
         sums = np.add.reduceat(N * left, np.arange(0, len(left), BLOCK * n), axis=1)
         seconds += sums @ sums.T
-    return Moments((G, g, power), fit.prior_std, seconds)
+    return Moments((G, g), fit.prior_std, seconds)
 
 
 def pieces_of(fit: Fit, whole: LongRecording) -> Iterator[Fit]:

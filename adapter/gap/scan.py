@@ -35,6 +35,7 @@ from adapter.gap.evidence import (
     Carried,
     Noise,
     Score,
+    noise_of,
     quiet_noise,
     score,
     scores,
@@ -83,11 +84,11 @@ class Lead:
     odds: float = 0.0
 
 
-def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, heard: Array) -> Noise:
+def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, weight: Array) -> Noise:
     """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it.
 
     Args:
-        heard: (k, n) one where the torque was measured, else zero.
+        weight: (k, n) of its rows: nothing where a joint rests, and holds what it likes.
     """
     prior = np.zeros(len(X))
     for c in candidates:
@@ -96,20 +97,22 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, heard
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
-    sigma = 0.2 * residual.std(axis=0) + LEAST_NM  # of the residual that may be noise, for a start
+    # of the residual that may be noise, for a start
+    sigma = 0.2 * noise_of(residual, weight).level + LEAST_NM
     white, data = X[used], (residual / sigma).ravel()
-    white *= heard / sigma
+    white *= weight / sigma
+    data *= weight.ravel()
     white = white.reshape(len(used), -1)
     for _ in range(2):
         information = white @ white.T
         information[np.diag_indices(len(used))] += prior[used] ** -2.0
         x[used] = cho_solve(cho_factor(information, lower=True), white @ data)
-        noise = quiet_noise(residual - np.tensordot(x, X, 1))
+        noise = quiet_noise(residual - np.tensordot(x, X, 1), weight)
         # some at a time into what is there: tables of a long recording are large
-        data = (heard * noise.whiten(residual)).ravel()
+        data = (weight * noise.whiten(residual)).ravel()
         for first in range(0, len(used), AT_ONCE):
             some = used[first : first + AT_ONCE]
-            part = (heard * noise.whiten(X[some])).reshape(len(some), -1)
+            part = (weight * noise.whiten(X[some])).reshape(len(some), -1)
             white[first : first + AT_ONCE] = part
     return noise
 
@@ -145,8 +148,8 @@ class SignatureTable:
             table, self.candidates = signatures(stages[i], joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
-                own, heard = fit.model.residual(i), fit.recordings[i].heard
-                noise.append(rich_noise(table, self.candidates, own, heard))
+                weight = fit.recordings[i].sliding * (fit.weights[i] if fit.doubts else 1.0)
+                noise.append(rich_noise(table, self.candidates, fit.model.residual(i), weight))
         if kind != CATALOGUED:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern | Law)]
         self.fit = fit.with_noise(noise) if rich else fit

@@ -3,14 +3,15 @@
     PYTHONPATH=. python tests/benchmarks/odd_trials.py gap --first 1
     PYTHONPATH=. python tests/benchmarks/odd_trials.py hidden --first 31000 --trials 100
 
-At a door (`gap`, `load`, `learn`) the 80 logs have the numbers of the log without the flaw, or are
-refused, as their verdicts say. `hidden` puts a flaw that changes nothing into each of many logs of
-one hidden effect: names and sizes are to be those that the log has without it.
+At a door (`gap`, `load`, `learn`, `replay`) the 80 logs have the numbers of the log without the
+flaw, or are refused, as their verdicts say. `hidden` puts a flaw that changes nothing into each of
+many logs of one hidden effect: names and sizes are to be those that the log has without it.
 """
 
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import tempfile
 import warnings
@@ -26,6 +27,7 @@ import numpy as np
 import adapter
 from adapter.effects.robots import read_robot
 from adapter.gap.load import find_load
+from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from tests.helpers.benchmark import Row, in_processes, options, told
 from tests.helpers.gap_mujoco import mujoco_recording
@@ -59,9 +61,25 @@ def by_load(log: adapter.Log, model: SelfModel) -> Numbers:
 
 
 def by_learn(log: adapter.Log, model: SelfModel) -> Numbers:
-    """Torques of a model that was learned, at some poses in motion, on a base that is level."""
-    learned, rng = adapter.learn(log, model, every=EVERY).model, np.random.default_rng(0)
-    learned = replace(learned, gravity=model.gravity)
+    """Torques of the model that was learned."""
+    return torques(adapter.learn(log, model, every=EVERY).model, model)
+
+
+def by_replay(log: adapter.Log, model: SelfModel) -> Numbers:
+    """The same of the command."""
+    with tempfile.TemporaryDirectory() as out:
+        robot = save_model(model, f"{out}/arm.json")
+        how = ("--quiet", "--no-report", "--every", str(EVERY), "--out", f"{out}/run")
+        asked = "replay", str(log.path), "--robot", str(robot), *how
+        done = subprocess.run((sys.executable, "-m", "adapter", *asked), capture_output=True)
+        if done.returncode not in (0, 9):  # nine: what was not shown is the documentation's
+            raise ValueError(done.stderr.decode())
+        return torques(adapter.load_model(f"{out}/run/model.json"), model)
+
+
+def torques(learned: SelfModel, model: SelfModel) -> Numbers:
+    """Of a model that was learned, at some poses in motion, on a base that is level."""
+    rng, learned = np.random.default_rng(0), replace(learned, gravity=model.gravity)
     q = rng.uniform(model.limits.lower, model.limits.upper, (50, len(model.limits.lower)))
     tau = adapter.inverse_dynamics(learned, q, rng.uniform(-0.5, 0.5, q.shape), 0.0 * q)
     off = TORQUE_NM / STDS / np.sqrt(2.0)
@@ -72,6 +90,7 @@ DOORS: dict[str, Callable[[adapter.Log, SelfModel], Numbers]] = {
     "gap": by_gap,
     "load": by_load,
     "learn": by_learn,
+    "replay": by_replay,
 }
 
 

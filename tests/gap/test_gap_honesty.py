@@ -164,6 +164,19 @@ def test_what_one_block_alone_shows_is_not_named(throughout: bool) -> None:
     assert worst(fit, weak(fit, carried)) == (None if throughout else 0)
 
 
+def test_what_the_other_folds_leave_open_takes_nothing_from_an_effect() -> None:
+    """A joint moves in two folds, in one of them beside what the others hardly show."""
+    fit = with_effect(nominal_fit(recording(0)), "coulomb_friction", JOINT, FC)
+    fold = np.repeat(np.arange(FOLDS), 200)
+    rows = np.zeros((len(fit.coefficients), len(fold)))
+    rows[0], rows[-1] = np.choose(fold, [1.0, 0.0, 1e-3, 1e-3]), fold < 2
+    for seed in range(10):
+        data = rows[-1] + np.random.default_rng(seed).standard_normal(len(fold))
+        parts = [(rows[:, fold == f], data[fold == f]) for f in range(FOLDS)]
+        products = np.array([x @ x.T for x, _ in parts]), np.array([x @ y for x, y in parts])
+        assert pays_held_out(fit, Folds(*products, np.full(len(rows), 100.0)), 0)
+
+
 # ---------------------------------------------------------------- doubt
 
 
