@@ -110,11 +110,11 @@ def table_of_options() -> str:
     for name, senses in sorted(options_of_commands().items()):
         for (takes, said), commands in senses.items():
             said = re.sub(r"^((?:\S+ ){2,}?\S+?)(?:[:;] | \().*", r"\1", said)
-            rows.setdefault((f"`{name}`", f"`{takes}`" if takes else "", said), []).extend(commands)
+            takes = " ".join(f"`{x}`" for x in takes.split("|") if x)
+            rows.setdefault((f"`{name}`", takes, said), []).extend(commands)
     lines = ["| option | takes | sense | commands |", "|---|---|---|---|"]
     for cells, commands in rows.items():
-        cells = *cells, ", ".join(dict.fromkeys(commands))
-        lines.append(f"| {' | '.join(x.replace('|', chr(92) + '|') for x in cells)} |")
+        lines.append(f"| {' | '.join((*cells, ', '.join(dict.fromkeys(commands))))} |")
     return "\n".join(lines)
 
 
