@@ -1,10 +1,19 @@
-"""Pictures of what can be identified and what cannot, computed from the Panda and drawn as SVG."""
+"""Pictures of the site as SVG: what can be identified (of the Panda), and the project's rooms.
+
+    python docs/site/figures.py FOLDER
+
+draws all of them.
+"""
 
 from __future__ import annotations
 
 import io
+import sys
+import tomllib
 from collections.abc import Callable
+from pathlib import Path
 
+import grimp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -116,6 +125,38 @@ def shapes_of_gaps() -> str:
     return _svg(figure)
 
 
+def rooms() -> str:
+    """How many imports lead from each room to each other, in the order that pyproject.toml sets."""
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8")
+    (contract,) = (
+        x for x in tomllib.loads(text)["tool"]["importlinter"]["contracts"] if "layers" in x
+    )
+    layers = [x.strip() for layer in contract["layers"] for x in layer.split("|")]
+    graph = grimp.build_graph("adapter", "drivers", "sim", cache_dir=None)
+    names = [x for x in layers if graph.find_children(x)] + ["sim", "drivers"]
+    within = {m: k for k, x in enumerate(names) for m in (x, *graph.find_descendants(x))}
+    counts = np.zeros((len(names), len(names)), dtype=int)
+    for module, row in within.items():
+        for other in graph.find_modules_directly_imported_by(module):
+            counts[row, within.get(other, row)] += 1
+    np.fill_diagonal(counts, 0)
+    figure, (ax,) = _figure(8.2, 6.4)
+    ax.imshow(np.sqrt(counts), cmap="GnBu", vmax=9.0)
+    for row, column in np.argwhere(counts):
+        ax.text(column, row, counts[row, column], ha="center", va="center", fontsize=7.5)
+    ax.plot([-0.5, len(names) - 0.5], [-0.5, len(names) - 0.5], color="#889", linewidth=0.8)
+    short = [x.removeprefix("adapter.") for x in names]
+    ax.set_xticks(range(len(names)), short, rotation=45, ha="right")
+    ax.set_yticks(range(len(names)), short)
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    ax.set(ylabel="imports", xlabel="is imported")
+    ax.set_title(
+        "Imports between rooms: none stands below the line, so there is no circle", loc="left"
+    )
+    return _svg(figure)
+
+
 def _matrix(kinds: Array, rows: list[str], columns: tuple[str, ...], title: str) -> str:
     figure, (ax,) = _figure(7.0, 0.36 * len(rows) + 1.3)
     ax.imshow(kinds, cmap=COLORS, vmin=NEVER, vmax=ALONE, aspect="auto")
@@ -162,4 +203,9 @@ FIGURES: dict[str, Callable[[], str]] = {
     "same-torque": same_torque,
     "speeds-tell": speeds_tell,
     "shapes-of-gaps": shapes_of_gaps,
+    "rooms": rooms,
 }
+
+if __name__ == "__main__":
+    for name, draw in FIGURES.items():
+        Path(sys.argv[1], f"{name}.svg").write_text(draw())

@@ -113,6 +113,6 @@ def _reference() -> Iterator[str]:
 def _examples() -> Iterator[str]:
     """The worked examples, whole; tests run them."""
     yield "# Examples\n"
-    yield "Four programs of less than a page. They stand in `docs/examples` and run in the tests.\n"
+    yield "Programs of less than a page. They stand in `docs/examples` and run in the tests.\n"
     for path in sorted((ROOT / "docs" / "examples").glob("*.py")):
         yield f"## `{path.name}`\n\n```python\n{path.read_text()}```\n"

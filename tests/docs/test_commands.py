@@ -21,7 +21,6 @@ from tests.helpers.pages import PATIENCE_S, ROOT, blocks, give, given
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(2 * PATIENCE_S)]
 
-LANES = 2  # commands at a time
 SHORT = ROOT / "recordings" / "panda_nominal_6s.mcap"
 
 # What of the tour is done for a shorter time here, for it takes as long as it says
@@ -67,7 +66,7 @@ def toured(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for line in lines:
             give(brief(line), folder, (ExitCode.DONE, ExitCode.NOT_CONVERGED))
 
-    with ThreadPoolExecutor(LANES) as lanes:  # the last groups take longest
+    with ThreadPoolExecutor(2) as lanes:  # the last groups take longest
         for done in [lanes.submit(give_all, lines) for lines in reversed(chains(TOUR))]:
             done.result()
     return folder
@@ -77,6 +76,8 @@ def test_the_tour(toured: Path) -> None:
     for name in ("tour", "again", "fast", "load", "bent", "forward", "gap"):
         assert (toured / "runs" / name / "report.html").exists()
     assert (toured / "panda_learned.urdf").exists()
+    assert (toured / "runs" / "fleet" / "fleet.html").exists()
+    assert load_model(toured / "runs" / "found.json").tree.parent == (-1, 0, 1, 2, 3, 4, 5)
     again, fast = (load_model(toured / "runs" / name / "model.json") for name in ("again", "fast"))
     live = load_model(toured / "runs" / "tour" / "model.json")
     assert (again.theta == live.theta).all() and (fast.theta != live.theta).any()
@@ -93,10 +94,6 @@ def test_finding_the_gap_from_python() -> None:
     exec(code.replace("runs/friction/recording.mcap", str(SHORT)), {})
 
 
-def test_the_tree_is_found(toured: Path) -> None:
-    assert load_model(toured / "runs" / "found.json").tree.parent == (-1, 0, 1, 2, 3, 4, 5)
-
-
 def test_your_own_log(toured: Path) -> None:
     log = read_log(toured / "runs" / "tour" / "recording.mcap")
     seconds = 1e-9 * log.stamp_ns[:, None]
@@ -109,10 +106,6 @@ def test_your_own_log(toured: Path) -> None:
     assert len(OWN_LOG) >= 3
     for line in OWN_LOG:
         give(brief(line), toured)
-
-
-def test_many_logs(toured: Path) -> None:
-    assert (toured / "runs" / "fleet" / "fleet.html").exists()
 
 
 def test_settings(tmp_path: Path) -> None:

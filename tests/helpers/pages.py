@@ -102,12 +102,19 @@ def options_of_commands() -> dict[str, dict[tuple[str, str], list[str]]]:
 
 
 def table_of_options() -> str:
-    """The table of docs/commands.md; `python -m tests.helpers.pages` prints it."""
-    lines = ["| option | takes | sense | commands |", "|---|---|---|---|"]
+    """The table of docs/commands.md; `python -m tests.helpers.pages` prints it.
+
+    Of a sense it has what stands before a colon, bracket or semicolon; --help has the rest.
+    """
+    rows: dict[tuple[str, ...], list[str]] = {}
     for name, senses in sorted(options_of_commands().items()):
         for (takes, said), commands in senses.items():
-            cells = f"`{name}`", f"`{takes}`" if takes else "", said, ", ".join(commands)
-            lines.append(f"| {' | '.join(x.replace('|', chr(92) + '|') for x in cells)} |")
+            said = re.sub(r"^((?:\S+ ){2,}?\S+?)(?:[:;] | \().*", r"\1", said)
+            takes = " ".join(f"`{x}`" for x in takes.split("|") if x)
+            rows.setdefault((f"`{name}`", takes, said), []).extend(commands)
+    lines = ["| option | takes | sense | commands |", "|---|---|---|---|"]
+    for cells, commands in rows.items():
+        lines.append(f"| {' | '.join((*cells, ', '.join(dict.fromkeys(commands))))} |")
     return "\n".join(lines)
 
 
