@@ -169,25 +169,10 @@ def write_urdf(model: SelfModel, path: Path, whose: str = "", told: bool = False
     except ModelError as error:
         warn([f"{whose}no URDF: {error}"])
         return False
-    if told:
-        write_robot(path, written)
-    else:
-        path.write_bytes(written.text.encode())
-    return True
-
-
-def write_robot(path: Path, written: RobotText) -> None:
-    """Write a robot's file; warns of what it lacks."""
     path.write_bytes(written.text.encode())
-    warn(shortcomings(path, written))
-
-
-def shortcomings(path: Path, written: RobotText) -> list[str]:
-    """What a robot's file lacks, and what else is to be said of it."""
-    lacking, listed = [], ", ".join(written.left_out)
-    if written.onto is None and listed:
-        lacking = [f"{path} has no full place for {listed}; a comment in it lists what is missing"]
-    return [*lacking, *(f"{path}: {note}" for note in written.notes)]
+    if told:
+        warn([f"{path}: {what}" for what in (written.lacks, *written.notes) if what])
+    return True
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -217,19 +202,21 @@ def run_export(args: argparse.Namespace) -> int:
         write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
         written = write(model)
         if args.samples is None or kind == "c":
-            write_robot(path, written)
+            path.write_bytes(written.text.encode())
         else:
             path.mkdir(parents=True, exist_ok=True)
             for number, own in enumerate(drawn):
                 file = path / f"{number:04d}{SUFFIXES[kind]}"
                 file.write_bytes(write(own).text.encode())
-            warn(shortcomings(path, written))
+        warn([f"{path}: {note}" for note in written.notes])
         facts[kind] = str(path)
         facts["onto"] = facts.get("onto") or written.onto
         facts["left_out"] = sorted({*facts.get("left_out", ()), *written.left_out})
         facts["notes"] = [*facts.get("notes", ()), *written.notes]
         onto = "" if written.onto is None else f" onto {written.onto}"
         show(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
+        if written.lacks:
+            show(f"  {written.lacks}")
     if args.ranges is not None:
         found = ranges(model)
         write_json(args.ranges, found)

@@ -83,10 +83,7 @@ def servo_mjcf(
     lacks = [
         f"the {what} of joint {numbered((np.flatnonzero(sizes) + 1).tolist())} is not in it: no "
         "field of MuJoCo's holds it; our own simulation has it"
-        for what, sizes in (
-            ("dead band", servos.dead_band),
-            ("backlash", servos.backlash),
-        )
+        for what, sizes in (("dead band", servos.dead_band), ("backlash", servos.backlash))
         if sizes.any()
     ]
     return replace(written, text=text, notes=(*written.notes, *notes, *lacks))

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from adapter.effects.c_text import c_text
 from adapter.effects.catalogue import KNOWN
-from adapter.effects.robots import additions
+from adapter.effects.robots import additions, how
 from adapter.model.mjcf_text import MJCF_PLACES
 from adapter.model.urdf_text import URDF_PLACES
 from tests.helpers.pages import PAGES
@@ -26,12 +26,9 @@ def table() -> str:
     lines = ["| effect | URDF | MJCF | C |", "|---|---|---|---|"]
     ball = replace(CASES[0], name="payload", joints=(), parameters={**BALL, "inertia": ROUND})
     for name, effect in {x.name: x for x in (*CASES, *SENSED, ball)}.items():
-        model, cells = model_with(replace(effect, interval_s=None)), [KNOWN[name].title]
-        for places in (URDF_PLACES, tuple(MJCF_PLACES)):
-            left = " ".join(additions(model, places).left_out)
-            _, part, note = left.partition(" (")
-            cells.append(note.removesuffix(")") if part else "no" if left else "whole")
-        cells.append("no" if name in c_text(model).left_out else "whole")
+        model, title = model_with(replace(effect, interval_s=None)), KNOWN[name].title
+        kept = [additions(model, places).kept for places in (URDF_PLACES, tuple(MJCF_PLACES))]
+        cells = [title, *(how(own[0].part) for own in (*kept, c_text(model).kept))]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

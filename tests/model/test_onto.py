@@ -78,7 +78,10 @@ DRESSED = """<?xml version="1.0" encoding="utf-8"?>
 </robot>
 """
 EMPTY = re.compile(r"<link name=\"(\w+)\"(\s*/>|>\s*</link>)")
-NEW = re.compile(r"\s*<(inertial>.*?</inertial>|origin [^>]*/>|dynamics [^>]*/>)", re.DOTALL)
+NEW = re.compile(
+    r"\s*<(inertial>.*?</inertial>|origin [^>]*/>|dynamics [^>]*/>|!-- adapter export: .*?-->)",
+    re.DOTALL,
+)
 
 
 def learned(model: SelfModel, seed: int = 0) -> SelfModel:
@@ -95,7 +98,7 @@ def learned(model: SelfModel, seed: int = 0) -> SelfModel:
 
 
 def skeleton(text: str) -> str:
-    """A URDF without inertials, origins and <dynamics>: what has to stay."""
+    """A URDF without inertials, origins, <dynamics> and our comment: what has to stay."""
     return EMPTY.sub(r"<link \1>", NEW.sub("", text))
 
 
@@ -179,8 +182,10 @@ def test_friction_that_was_learned_stands_in_dynamics_and_other_stays() -> None:
     assert text.count("<dynamics") == 1
     ripple = {"effect": "torque_offset", "joints": [1], "parameters": {"o": 0.3}}
     both = robot_urdf(replace(model, effects=(viscous, ripple)))
-    assert both.text == text and both.left_out == ("torque_offset",)
-    assert "torque_offset of j1" in both.notes[0]
+    (said,) = re.findall(r"\n  <!-- adapter export: .*?-->", both.text, re.DOTALL)
+    assert both.text.replace(said, "") == text and both.left_out == ("torque_offset",)
+    assert "viscous friction: whole\n    torque sensor offset: no\n      j1: o = 0.3 N m" in said
+    assert robot_urdf(replace(read_quietly(both.text), effects=(viscous, ripple))).text == both.text
 
 
 def test_tool_load_encoder_and_tilt_are_in_the_numbers() -> None:
