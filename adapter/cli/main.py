@@ -104,7 +104,7 @@ COMMANDS = {  # in the order of --help
     ),
     "export": Command(
         files_options.declare_export,
-        "write a model file as URDF",
+        "write a model for simulators",
         "adapter.cli.results:run_export",
         begins="reading {model}",
     ),

@@ -149,7 +149,7 @@ def _plain(kernel: Any) -> Callable[..., Any]:
     )
 
 
-def c_text(model: SelfModel) -> RobotText:
+def c_text(model: SelfModel, onto: None = None, alone: bool = True) -> RobotText:
     """The arm's torque in C99: `adapter_torque` and its parts, without allocation.
 
     Raises:

@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 
 from adapter.effects.active import Active, active_effects, check_effects
 from adapter.effects.catalogue import CATALOGUE, KNOWN
+from adapter.model.filled import MJCF_PLACES, PLACES, filled
 from adapter.model.mjcf import mjcf_onto, read_mjcf
-from adapter.model.mjcf_text import MJCF_PLACES, mjcf_text
 from adapter.model.robots import documented
 from adapter.model.self_model import MJCF, SelfModel, gravity_down, theta_doubt
 from adapter.model.tree import Tree
 from adapter.model.urdf import file_text, urdf_onto
-from adapter.model.urdf_text import NO_PLACE, STIFFNESS, URDF_PLACES, Additions, Kept, urdf_text
+from adapter.model.urdf_text import NO_PLACE, STIFFNESS, Additions, Kept
 from adapter.model.xml_edit import XmlText
 
 
@@ -92,11 +92,6 @@ class RobotText:
         return "; ".join(said) + more * bool(said)
 
 
-def how(part: str | None) -> str:
-    """How much of an effect a file holds, in words."""
-    return "whole" if part is None else part or "no"
-
-
 def kept_lines(kept: Sequence[Kept]) -> list[str]:
     """A line for each effect and how much of it a file holds, with its numbers where not all."""
     found = dict[tuple[str, str | None], list[str]]()
@@ -104,7 +99,8 @@ def kept_lines(kept: Sequence[Kept]) -> list[str]:
         found.setdefault((one.effect, one.part), []).append(one.of)
     lines = []
     for (name, part), own in found.items():
-        lines += [f"{KNOWN[name].title}: {how(part)}", *(f"  {x}" for x in own if part is not None)]
+        how = "whole" if part is None else part or "no"
+        lines += [f"{KNOWN[name].title}: {how}", *(f"  {x}" for x in own if part is not None)]
     return lines
 
 
@@ -119,21 +115,14 @@ def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     Raises:
         ModelError: a URDF that is not the model's, or where a body is physically impossible.
     """
-    more, source = additions(model, URDF_PLACES), model.source
-    if not np.array_equal(model.gravity, gravity_down()):
-        more.left_out.append(f"gravity {model.gravity.tolist()} m/s2 in base axes")
+    more, source = additions(model, PLACES["urdf"]), model.source
     if onto is not None:
         text, file = file_text(onto), str(onto)
     elif source is not None and source.text is not None and not alone:
         text, file = source.text, source.file
     else:
-        return _with_head(model, more, "URDF", urdf_text(model, more))
-    return _with_head(model, more, "URDF", *urdf_onto(model, more, text, file), file)
-
-
-def to_urdf(model: SelfModel) -> str:
-    """URDF text of the arm alone with its effects, as far as a URDF goes. Raises ModelError."""
-    return robot_urdf(model, alone=True).text
+        return _with_head(model, more, "urdf", filled("urdf", model, more))
+    return _with_head(model, more, "urdf", *urdf_onto(model, more, text, file), file)
 
 
 def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = False) -> RobotText:
@@ -142,15 +131,28 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     Raises:
         ModelError: as there, and where MuJoCo, which reads an MJCF, is not installed.
     """
-    more, source, notes = additions(model, tuple(MJCF_PLACES)), model.source, list[str]()
+    more, source, notes = additions(model, PLACES["mjcf"]), model.source, list[str]()
     if onto is None and source is not None and source.format == MJCF and not alone:
         onto = source.file
         if not Path(onto).exists():
             notes = [f"{onto}, which the model came from, is not there; this is the arm alone"]
             onto = None
     if onto is None:
-        return _with_head(model, more, "MJCF", mjcf_text(model, more), notes)
-    return _with_head(model, more, "MJCF", *mjcf_onto(model, more, onto), str(onto))
+        return _with_head(model, more, "mjcf", filled("mjcf", model, more), notes)
+    return _with_head(model, more, "mjcf", *mjcf_onto(model, more, onto), str(onto))
+
+
+def robot_text(kind: str, model: SelfModel, onto: None = None, alone: bool = True) -> RobotText:
+    """SDF, USD or Isaac Lab's actuators of the arm alone with its effects.
+
+    Args:
+        kind: of `filled.PLACES`.
+
+    Raises:
+        ModelError: where a body is physically impossible.
+    """
+    more = additions(model, PLACES[kind])
+    return _with_head(model, more, kind, filled(kind, model, more))
 
 
 def _with_head(
@@ -165,15 +167,25 @@ def _with_head(
 
     None where it holds all: what is written onto a file then leaves it as it is but for numbers.
     """
-    xml, doubt = XmlText(text, model.name), theta_doubt(model)
-    said = [f"no place for {x}" for x in more.left_out] + [f"θ: {doubt}"] * bool(doubt)
-    lines = [*kept_lines(more.kept), *said]
+    doubt, missing = theta_doubt(model), list(more.left_out)
+    if kind != "mjcf" and not np.array_equal(model.gravity, gravity_down()):
+        missing.append(f"gravity {model.gravity.tolist()} m/s2 in base axes")
+    said = [f"no place for {x}" for x in missing] + [f"θ: {doubt}"] * bool(doubt)
+    lines = [
+        f"what this {kind.upper()} holds of {model.name}, with its bodies",
+        *kept_lines(more.kept),
+    ]
     if all(x.part is None for x in more.kept) and not said:
         lines = []
-    xml.remark(
-        [f"what this {kind} holds of {model.name}, with its bodies", *lines] if lines else []
-    )
-    return RobotText(xml.text(), onto, tuple(more.kept), (*notes, *said))
+    lines += said
+    if text.lstrip().startswith("<"):
+        xml = XmlText(text, model.name)
+        xml.remark(lines)
+        text = xml.text()
+    else:
+        head = "\n".join("# " + " ".join(x.splitlines()) for x in lines or [model.name])
+        text = text.replace("#@HEAD@", head, 1)
+    return RobotText(text, onto, tuple(more.kept), (*notes, *said))
 
 
 def additions(model: SelfModel, places: Sequence[str]) -> Additions:
@@ -205,11 +217,6 @@ def in_words(active: Active, tree: Tree) -> str:
     """The joint that an effect has, and its numbers."""
     units = active.effect.units(active.joint >= 0 and tree.slides[active.joint])
     where = "" if active.joint < 0 else f"{tree.joint_names[active.joint]}: "
-    said = [f"{key} = {_number(x)} {units[key]}" for key, x in active.values.items()]
+    told = {key: np.vectorize("{:.4g}".format)(x).tolist() for key, x in active.values.items()}
+    said = [f"{key} = {x} {units[key]}".replace("'", "") for key, x in told.items()]
     return where + ", ".join(said) + (" (it ended)" if not active.lasting else "")
-
-
-def _number(value: object) -> str:
-    if isinstance(value, int | float):
-        return f"{value:.4g}"
-    return str([float(f"{x:.4g}") for x in np.ravel(np.asarray(value, float))])

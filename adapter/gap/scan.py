@@ -30,15 +30,7 @@ from adapter.gap.candidates import (
     signatures,
     simpler_wins,
 )
-from adapter.gap.evidence import (
-    BAND_HZ,
-    Carried,
-    Noise,
-    Score,
-    quiet_noise,
-    score,
-    scores,
-)
+from adapter.gap.evidence import BAND_HZ, Carried, Noise, Score, quiet_noise, score, scores
 from adapter.gap.fit import Fit
 from adapter.judgement.noise import LEAST_NM
 from adapter.model.spatial import Array

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError, ModelWarning
 from adapter.model import spatial
+from adapter.model.filled import MJCF_PLACES, inertial_attributes, joint_attributes
 from adapter.model.inertia import move_theta, theta_from_body
-from adapter.model.mjcf_text import MJCF_PLACES, inertial_attributes, joint_attributes
 from adapter.model.onto import Changes, changes_onto
 from adapter.model.robot_file import FileJoint, FileRobot, Merged
 from adapter.model.self_model import MJCF, SelfModel, Source

@@ -1,4 +1,4 @@
-"""A self model as URDF text, with the joint axes that its source had.
+"""A self model as a robot's file has it, with the joint axes that its source had.
 
 What effects add to the arm comes in a record that knows nothing of them; `effects.robots` fills it.
 """
@@ -6,10 +6,8 @@ What effects add to the arm comes in a record that knows nothing of them; `effec
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from typing import NamedTuple
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,19 +15,19 @@ from numpy.typing import ArrayLike
 from adapter.errors import ModelError
 from adapter.model.inertia import (
     CONSISTENCY_TOLERANCE,
-    body_from_theta,
     is_consistent,
     min_eigenvalue,
     six_from_tensor,
 )
 from adapter.model.robot_file import SLIDING, FileJoint, FileRobot
 from adapter.model.self_model import LIMITS, URDF, SelfModel, Source, base_inertia, turned_theta
-from adapter.model.spatial import Array, at_joints, rpy_from_matrix, z_to_axis
+from adapter.model.spatial import Array, at_joints, quaternion_from_matrix, z_to_axis
 from adapter.model.tree import BASE
 
 # What a joint of a file may have beside its limits; a format has some of them.
-DAMPING, FRICTION, ARMATURE, STIFFNESS = "damping", "friction", "armature", "stiffness"
-URDF_PLACES = (DAMPING, FRICTION)
+# Breakaway is by how much more than friction it takes to begin to slide.
+DAMPING, FRICTION, BREAKAWAY = "damping", "friction", "breakaway"
+ARMATURE, STIFFNESS = "armature", "stiffness"
 NO_PLACE = ""
 SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # of a tensor, as URDF names them
 NO_INERTIA = """<inertial>
@@ -95,10 +93,6 @@ class Additions:
         self.told.add((place, joint))
         return part
 
-    def of_joint(self, joint: int) -> dict[str, float]:
-        """What a joint has, by place, where that is not zero."""
-        return {place: float(x[joint]) for place, x in self.joint.items() if x[joint]}
-
     def carry(self, theta: Array) -> bool:
         """A body (10,) on the last link; within that link (False) where it could not be one."""
         alone = is_consistent(theta, -CONSISTENCY_TOLERANCE * float(np.max(np.abs(theta))))
@@ -155,54 +149,10 @@ def as_file(model: SelfModel, more: Additions) -> FileRobot:
     return FileRobot("", model.name, links, joints, Source(URDF, ""))
 
 
-def urdf_text(model: SelfModel, more: Additions) -> str:
-    """URDF text of the arm alone; the inverse of `urdf.read_urdf` up to rounding.
-
-    Links of no mass are said in numbers: to one without <inertial> PyBullet gives 1 kg.
-
-    Args:
-        model: the arm; more: what it has beside, `places` being `URDF_PLACES`.
-
-    Raises:
-        ModelError: as `as_file`.
-    """
-    file, robot = as_file(model, more), ET.Element("robot", name=model.name)
-    over = {joint.child: joint for joint in file.joints.values()}
-    for name, theta in file.links.items():
-        _add_link(robot, name, theta)
-        if name in over:
-            _add_joint(robot, over[name], more, model.tree.joint_names)
-    if more.tilt is not None:
-        base, upright = model.tree.base_name, f"{model.tree.base_name}_upright"
-        _add_link(robot, upright, np.zeros(10))
-        _add_origin(_joint(robot, f"{upright}_joint", "fixed", upright, base), more.tilt)
-    ET.indent(robot)
-    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
-
-
-def number_text(values: ArrayLike) -> str:
+def number_text(values: ArrayLike, between: str = " ") -> str:
     """Numbers that read back unchanged; a negative zero loses its sign."""
     numbers = np.atleast_1d(np.asarray(values, dtype=np.float64))
-    return " ".join(repr(float(value) + 0.0) for value in numbers)
-
-
-def _add_origin(element: ET.Element, rotation: Array, position: Array | None = None) -> None:
-    xyz = number_text(np.zeros(3) if position is None else position)
-    ET.SubElement(element, "origin", xyz=xyz, rpy=number_text(rpy_from_matrix(rotation)))
-
-
-def _add_link(robot: ET.Element, name: str, theta: Array) -> None:
-    """A link with its inertia (10,) in its own frame."""
-    if not np.any(theta):
-        robot.append(ET.fromstring(f"<link name={quoteattr(name)}>{NO_INERTIA}</link>"))
-        return
-    link = ET.SubElement(robot, "link", name=name)
-    mass, com, tensor = body_from_theta(theta)
-    inertial = ET.SubElement(link, "inertial")
-    _add_origin(inertial, np.eye(3), com)
-    ET.SubElement(inertial, "mass", value=number_text(mass))
-    six = {key: number_text(value) for key, value in six_named(tensor).items()}
-    ET.SubElement(inertial, "inertia", six)
+    return between.join(repr(float(value) + 0.0) for value in numbers)
 
 
 def check_possible(theta: Array, name: str) -> None:
@@ -220,26 +170,8 @@ def six_named(tensor: Array) -> dict[str, float]:
     return dict(zip(SIX, six_from_tensor(tensor).tolist(), strict=True))
 
 
-def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
-    joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    return joint
-
-
-def _add_joint(robot: ET.Element, own: FileJoint, more: Additions, moving: tuple[str, ...]) -> None:
-    """A joint with its place, and one of those that move with its axis, losses and limits."""
-    joint = _joint(robot, own.name, own.kind, own.parent, own.child)
-    _add_origin(joint, own.rotation, own.position)
-    if own.name not in moving:
-        return
-    ET.SubElement(joint, "axis", xyz=number_text(own.axis))
-    losses = more.of_joint(moving.index(own.name))
-    if losses:
-        ET.SubElement(joint, "dynamics", {key: number_text(x) for key, x in losses.items()})
-    limits = zip(LIMITS, own.limits, strict=True)
-    known = {key: number_text(value) for key, value in limits if math.isfinite(value)}
-    if own.kind in SLIDING:  # of these the format demands both; 0 says nothing
-        known = dict.fromkeys(LIMITS[2:], "0") | known
-    if known:
-        ET.SubElement(joint, "limit", known)
+def principal(tensor: Array) -> tuple[Array, Array]:
+    """Principal moments (3,) of an inertia tensor and their axes, [w x y z] (4,)."""
+    moments, axes = np.linalg.eigh(tensor)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))  # right-handed
+    return moments, quaternion_from_matrix(axes)

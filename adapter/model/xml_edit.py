@@ -15,6 +15,7 @@ from adapter.errors import ModelError
 
 _OURS = "adapter export: "
 _REMARK = re.compile(rb"\s*<!-- " + _OURS.encode() + rb".*?-->", re.DOTALL)
+_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""")  # up to its `>`; one in a value is none
 _ATTRIBUTE = re.compile(rb"""([^\s=/>"'<]+)\s*=\s*("[^"]*"|'[^']*')""")
 
 
@@ -70,15 +71,8 @@ class XmlText:
     def _start(self, tag: str, attributes: dict[str, str], start: int) -> None:
         parent = self._open[-1] if self._open else None
         element = Element(tag, attributes, start, parent)
-        at, quote = start, 0  # after the `>` of the start tag; one in a value is none
-        while quote or self._bytes[at] != ord(">"):
-            byte = self._bytes[at]
-            if quote:
-                quote = 0 if byte == quote else quote
-            elif byte in b"\"'":
-                quote = byte
-            at += 1
-        element.inside = at + 1
+        whole = _TAG.match(self._bytes, start)
+        element.inside = whole.end() if whole else start
         if parent is None:
             self.root = element
         else:
