@@ -94,7 +94,7 @@ FORMATS = {  # how a file of each ends, and what it is
     "urdf": (".urdf", "URDF to write"),
     "mjcf": (".xml", "MJCF to write, of MuJoCo"),
     "sdf": (".sdf", "SDF to write, of Gazebo: the arm alone"),
-    "usd": (".usda", "USD to write: the arm alone"),
+    "usd": (".usda", "USD to write: the arm alone, or a layer --onto ASSET.usd (extra [usd])"),
     "isaac": (".py", "what joints have, as Isaac Lab's actuators (Python), to write"),
     "c": (".c", "the arm's torque in C99, bodies and effects: feed-forward, what no format holds"),
 }
@@ -127,8 +127,8 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
         "--onto",
         type=Path,
         metavar="INPUT",
-        help="the robot's file, .urdf or .xml (MJCF); written to INPUT.learned.urdf (.xml) where "
-        "neither --urdf nor --mjcf is given",
+        help="the robot's file, .urdf, .xml (MJCF) or .usd; written to INPUT.learned.urdf (.xml, "
+        ".usda) where no option says so",
     )
     onto.add_argument("--alone", action="store_true", help="the arm alone, without pictures")
     options.add_json(parser)
@@ -155,11 +155,12 @@ def _check_export(args: argparse.Namespace) -> None:
         have = ", ".join(f"--{kind} FILE" for kind in FORMATS)
         raise UsageError(f"nothing to write; have: {have}, --onto INPUT, --ranges FILE")
     if args.onto is not None:
-        kind = {".urdf": "urdf", ".xml": "mjcf"}.get(args.onto.suffix)
+        ends = args.onto.suffix[:4]  # of .usda and .usdc as of .usd
+        kind = {".urd": "urdf", ".xml": "mjcf", ".usd": "usd"}.get(ends)
         if kind is None:
-            raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
-        if not asked.keys() & {"urdf", "mjcf"}:
-            asked[kind] = args.onto.with_suffix(f".learned{args.onto.suffix}")
+            raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml), a .usd")
+        if not asked.keys() & {"urdf", "mjcf", "usd"}:
+            asked[kind] = args.onto.with_suffix(f".learned{FORMATS[kind][0]}")
             setattr(args, kind, asked[kind])
         elif kind not in asked:
             raise UsageError(f"--onto {args.onto} is written by --{kind} FILE")

@@ -197,7 +197,7 @@ def run_export(args: argparse.Namespace) -> int:
         path, ends = getattr(args, kind), FORMATS[kind][0]
         if path is None:
             continue
-        fits = args.onto is not None and args.onto.suffix == ends
+        fits = args.onto is not None and args.onto.suffix[:4] == ends[:4]
         write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
         written = write(model)
         if args.samples is None or kind == "c":

@@ -160,8 +160,8 @@ def c_text(model: SelfModel, onto: None = None, alone: bool = True) -> RobotText
     bare = with_bodies(model)
     laws = _Laws(bare)
     acting = lasting_effects(model.effects, model.tree.n)
-    bodies = [x for x in acting if isinstance(x.effect, BodyEffect)]
-    kept = (*(Kept(x.effect.name, "", None) for x in bodies), *laws.kept)
+    bodies = {x.effect.name: None for x in acting if isinstance(x.effect, BodyEffect)}
+    kept = (*(Kept(name, "", None) for name in bodies), *laws.kept)
     told = [
         f"The torque of {model.name}, written by `adapter export --c`.",
         f"Joints, in order: {', '.join(model.tree.joint_names)}.",

@@ -24,6 +24,7 @@ from adapter.model.self_model import MJCF, SelfModel, gravity_down, theta_doubt
 from adapter.model.tree import Tree
 from adapter.model.urdf import file_text, urdf_onto
 from adapter.model.urdf_text import NO_PLACE, STIFFNESS, Additions, Kept
+from adapter.model.usd import usd_onto
 from adapter.model.xml_edit import XmlText
 
 
@@ -142,17 +143,21 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     return _with_head(model, more, "mjcf", *mjcf_onto(model, more, onto), str(onto))
 
 
-def robot_text(kind: str, model: SelfModel, onto: None = None, alone: bool = True) -> RobotText:
+def robot_text(
+    kind: str, model: SelfModel, onto: str | Path | None = None, alone: bool = True
+) -> RobotText:
     """SDF, USD or Isaac Lab's actuators of the arm alone with its effects.
 
     Args:
-        kind: of `filled.PLACES`.
+        kind: of `filled.PLACES`; onto: of USD, an asset that the text is a layer over.
 
     Raises:
-        ModelError: where a body is physically impossible.
+        ModelError: as `robot_urdf`; MeansError: an asset, and usd-core is not installed.
     """
     more = additions(model, PLACES[kind])
-    return _with_head(model, more, kind, filled(kind, model, more))
+    if onto is None:
+        return _with_head(model, more, kind, filled(kind, model, more))
+    return _with_head(model, more, kind, *usd_onto(model, more, onto), str(onto))
 
 
 def _with_head(

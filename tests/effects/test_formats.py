@@ -8,6 +8,7 @@ prints it.
 from __future__ import annotations
 
 import ast
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +19,12 @@ import pytest
 
 import adapter
 from adapter.cli import main
+from adapter.cli.exit_codes import ExitCode
 from adapter.cli.files_options import FORMATS
 from adapter.effects.c_text import c_text
 from adapter.effects.catalogue import KNOWN
 from adapter.effects.robots import additions, kept_lines, robot_text
+from adapter.errors import ModelError
 from adapter.model.filled import PLACES
 from adapter.model.inertia import move_theta, tensor_from_six, theta_from_body
 from adapter.model.model_file import save_model
@@ -119,9 +122,8 @@ def test_sdf_reads_back(arm: SelfModel) -> None:
     assert apart(read, arm) < 1e-12 and written.left_out == ("motor_inertia", "stribeck_friction")
 
 
-def test_usd_reads_back_in_its_precision(arm: SelfModel, tmp_path: Path) -> None:
-    Usd = pytest.importorskip("pxr.Usd")
-    stage = Usd.Stage.Open(str(adapter.export(arm, tmp_path / "arm.usda")))
+def read_usd(path: Path, arm: SelfModel) -> dict[str, list[Any]]:
+    stage = pytest.importorskip("pxr.Usd").Stage.Open(str(path))
     prims, read = {x.GetName(): x for x in stage.Traverse()}, dict[str, list[Any]]()
 
     def value(name: str, key: str) -> np.ndarray:
@@ -152,7 +154,29 @@ def test_usd_reads_back_in_its_precision(arm: SelfModel, tmp_path: Path) -> None
                 unit if which == "viscous" else 1
             )
             assert found == pytest.approx(own[k] if key and k < 4 else 0.0, rel=2.0**-23)
-    assert apart(read, arm) < 2.0**-23
+    return read
+
+
+def test_usd_and_a_layer_over_an_asset_read_back_in_their_precision(
+    arm: SelfModel, tmp_path: Path
+) -> None:
+    assert apart(read_usd(adapter.export(arm, tmp_path / "arm.usda"), arm), arm) < 2.0**-23
+    documented = read_quietly(urdf_text("panda") if arm.tree.n == 7 else machine_urdf("scara"))
+    asset = adapter.export(replace(documented, name="an arm"), tmp_path / "asset.usda")
+    whole, path = asset.read_bytes(), save_model(arm, tmp_path / "m.json")
+    assert main(["export", str(path), "--onto", str(asset)]) == 0 and asset.read_bytes() == whole
+    layer = tmp_path / "asset.learned.usda"
+    assert apart(read_usd(layer, arm), arm) < 2.0**-23
+    said = layer.read_text()
+    assert "joint spring: no" in said and "Limit" not in said and "xformOp" not in said
+    for was, now, why in (
+        (b"metersPerUnit = 1", b"metersPerUnit = 0.01", "its units are 0.01 m"),
+        (b"Pos1 = (0,", b"Pos1 = (1,", "does not pass through its link"),
+        (whole, b"no USD", "cannot be read as USD"),
+    ):
+        (other := tmp_path / f"{why[:4]}.usda").write_bytes(whole.replace(was, now))
+        with pytest.raises(ModelError, match=rf"{other.name}: .*{why}"):
+            robot_text("usd", arm, other)
 
 
 def test_isaac_lab_reads_the_models_numbers(arm: SelfModel) -> None:
@@ -172,7 +196,7 @@ def test_isaac_lab_reads_the_models_numbers(arm: SelfModel) -> None:
 
 
 def test_the_answer_is_a_line_for_each_file_and_one_of_what_it_drops(
-    arm: SelfModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arm: SelfModel, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
     path = save_model(arm, tmp_path / "m.json")
     files = [tmp_path / f"arm{ends}" for ends, _ in FORMATS.values()]
@@ -186,6 +210,10 @@ def test_the_answer_is_a_line_for_each_file_and_one_of_what_it_drops(
     assert "  drops joint spring, reflected motor inertia; holds in part Stribeck" in dropped[0]
     assert len(dropped) == 5 and all(len(x) < 200 for x in said)  # C has all
     assert all("Stribeck friction: " in x.read_text() for x in files)
+    for name in {"pxr", *(x for x in sys.modules if x.startswith("pxr."))}:
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["export", str(path), "--onto", str(files[3])]) == ExitCode.NO_MEANS
+    assert "usd-core is not installed: pip install 'panda-adapter[usd]'" in capsys.readouterr().err
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import pytest
 
 from adapter.effects.robots import read_robot, robot_mjcf
 from adapter.effects.torque import ModelTorque
-from adapter.errors import ModelError, ModelWarning
+from adapter.errors import MeansError, ModelError, ModelWarning
 from adapter.model.model_file import load_model, save_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
@@ -202,5 +202,5 @@ def test_a_floating_robot_is_the_free_body_that_carries_joints(arm: Path) -> Non
 
 def test_without_mujoco_the_extra_is_named(arm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ModelError, match=r"panda-adapter\[mujoco\]"):
+    with pytest.raises(MeansError, match=r"panda-adapter\[mujoco\]"):
         read_robot(arm)
