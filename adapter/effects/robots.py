@@ -177,7 +177,7 @@ def _with_head(
         missing.append(f"gravity {model.gravity.tolist()} m/s2 in base axes")
     said = [f"no place for {x}" for x in missing] + [f"θ: {doubt}"] * bool(doubt)
     lines = [
-        f"what this {kind.upper()} holds of {model.name}, with its bodies",
+        f"what this {kind.upper()} holds of the effects of {model.name}",
         *kept_lines(more.kept),
     ]
     if all(x.part is None for x in more.kept) and not said:
