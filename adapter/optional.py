@@ -20,6 +20,7 @@ EXTRAS = {  # module -> what it is called, and the extra that brings it
     "fsspec": ("fsspec", "cluster"),
     "gymnasium": ("Gymnasium", "gymnasium"),
     "mujoco": ("MuJoCo", "mujoco"),
+    "pxr": ("usd-core", "usd"),
     "pyarrow": ("PyArrow", "tables"),
     "pybullet": ("PyBullet", "sim"),
     "sklearn": ("scikit-learn", "experiment"),

@@ -19,11 +19,7 @@ Builder = Callable[[str], "Driver"]
 # wrong is told before anything is loaded.
 LOG = ".files.log:LogArm"  # takes (file, joint names)
 # Behind these an arm may be real; take (address, joint names, whether the arm may be moved).
-HARDWARE = {
-    "fci": ".fci.arm:FciArm",
-    "can": ".damiao.arm:DamiaoArm",
-    "ros2": ".ros2.arm:Ros2Arm",
-}
+HARDWARE = {"fci": ".fci.arm:FciArm", "can": ".damiao.arm:DamiaoArm", "ros2": ".ros2.arm:Ros2Arm"}
 NAMELESS = ("can", "ros2")  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
 OWN = ".own:open_own"  # takes the same

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from adapter.cli.exit_codes import ExitCode
-from adapter.model.robot_names import robot_names
+from adapter.model import robot_names
 from adapter.shadowed import own_name
 
 SHELLS = ("bash", "zsh", "fish")

@@ -1,4 +1,4 @@
-"""`adapter import`, `recover` and `info`: work on files, and bring nothing heavy."""
+"""`adapter import`, `recover`, `info`, `effects`: work on files, and bring nothing heavy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from dataclasses import asdict
 from importlib import import_module
 from itertools import compress
+from pathlib import Path
 
 import numpy as np
 
@@ -13,12 +14,16 @@ from adapter.cli.common import robot_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
 from adapter.effects.base import with_squares
+from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.kept import keep, with_kept
+from adapter.effects.law import EXPRESSIONS, LAW
 from adapter.effects.robots import read_robot
+from adapter.errors import UsageError
 from adapter.judgement.priors import is_shown
 from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
-from adapter.runs.terminal import show, warn, write_json
+from adapter.runs.terminal import print_table, show, warn, write_json
 from adapter.signals.importer import import_file, is_data_set, recording_log, table_log
 from adapter.signals.recording import describe, summary
 from adapter.signals.source_signals import ImportSpec
@@ -95,6 +100,26 @@ def run_info(args: argparse.Namespace) -> int:
         show(line)
     asked = args.topic is not None and facts.get("problem") is not None
     return ExitCode.WRONG_USE if asked else ExitCode.DONE
+
+
+def run_effects(args: argparse.Namespace) -> int:
+    """Carry `effects` out."""
+    if args.keep:
+        if args.keep[0] != "keep" or len(args.keep) != 2 or args.name is None:
+            raise UsageError("as in: adapter effects keep results/gap --as hose_joint_3")
+        show(keep(Path(args.keep[1]), args.name, args.joint, args.kept))
+        show(f"kept in {args.kept}; looked for by adapter gap ... --effects {args.kept}")
+        return 0
+    rows = []
+    with with_kept(args.kept if args.kept.exists() else None):
+        for effect in CATALOGUE.values():
+            numbers = ", ".join(f"{p.key} {p.written}".rstrip() for p in effect.parameters)
+            own = f" ({effect.in_files.removeprefix(LAW)})" if effect.in_files else ""
+            rows.append((effect.name, f"{effect.title}{own}", effect.scope, numbers))
+    print_table(("name", "what", "of", "numbers"), rows)
+    said = ", ".join(EXPRESSIONS)
+    show(f"laws of what none of these is: c times {said} (ⱼ: another joint's)")
+    return 0
 
 
 def opened(args: argparse.Namespace) -> Log | None:

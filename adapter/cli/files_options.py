@@ -90,13 +90,24 @@ def _check_info(args: argparse.Namespace) -> None:
         options.check_files(args.file)
 
 
+FORMATS = {  # how a file of each ends, and what it is
+    "urdf": (".urdf", "URDF to write"),
+    "mjcf": (".xml", "MJCF to write, of MuJoCo"),
+    "sdf": (".sdf", "SDF to write, of Gazebo: the arm alone"),
+    "usd": (".usda", "USD to write: the arm alone, or a layer --onto ASSET.usd (extra [usd])"),
+    "isaac": (".py", "what joints have, as Isaac Lab's actuators (Python), to write"),
+    "c": (".c", "the arm's torque in C99, bodies and effects: feed-forward, what no format holds"),
+}
+
+
 def declare_export(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
-        "Write a model as URDF or MJCF. Onto the robot's file (INPUT, or by default the one that "
-        "the model came from) only what was learned is written: inertials, places of joints, "
-        "friction; every other byte stays as it is. With --servo a robot is written whose joints "
-        "follow position commands as its servos do. Or write a recording as a data set of LeRobot."
+        "Write a model for simulators. Onto the robot's file (INPUT, or by default the URDF or "
+        "MJCF that the model came from) only what was learned is written: inertials, places of "
+        "joints, friction, and what is missing as a comment; every other byte stays as it is. With "
+        "--servo a robot is written whose joints follow position commands as its servos do. Or "
+        "write a recording as a data set of LeRobot."
     )
     add = parser.add_argument
     what = "model file (.json), with --servo any robot, or a recording"
@@ -104,22 +115,20 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
     said = "servo.toml of gap: MuJoCo's position actuators, delay, friction, armature, ground"
     add("--servo", type=Path, metavar="FILE", help=said)
     add("--lerobot", type=Path, metavar="FOLDER", help="of LOG: a data set, version 3, to write")
-    add("--urdf", type=Path, metavar="FILE", help="to write")
-    add("--mjcf", type=Path, metavar="FILE", help="to write")
-    said = "models drawn from what is known of MODEL; --urdf and --mjcf name a folder: 0000.urdf"
+    for kind, (_, said) in FORMATS.items():
+        add(f"--{kind}", type=Path, metavar="FILE", help=said)
+    said = "models drawn from what is known of MODEL; --urdf, --mjcf... name a folder: 0000.urdf"
     add("--samples", type=int, metavar="N", help=said)
     add("--seed", type=int, default=0, help="of the samples")
     said = "means, standard deviations, and the directions that make torques unsure, JSON to write"
     add("--ranges", type=Path, metavar="FILE", help=said)
-    said = "the arm's torque in C99, bodies and effects: feed-forward, and what no format holds"
-    add("--c", type=Path, metavar="FILE", help=said)
     onto = parser.add_mutually_exclusive_group()
     onto.add_argument(
         "--onto",
         type=Path,
         metavar="INPUT",
-        help="the robot's file, .urdf or .xml (MJCF); written to INPUT.learned.urdf (.xml) where "
-        "neither --urdf nor --mjcf is given",
+        help="the robot's file, .urdf, .xml (MJCF) or .usd; written to INPUT.learned.urdf (.xml, "
+        ".usda) where no option says so",
     )
     onto.add_argument("--alone", action="store_true", help="the arm alone, without pictures")
     options.add_json(parser)
@@ -127,34 +136,38 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_export(args: argparse.Namespace) -> None:
+    asked = {kind: path for kind in FORMATS if (path := getattr(args, kind)) is not None}
     if args.lerobot is not None:
-        others = args.urdf, args.mjcf, args.onto, args.alone, args.servo, args.ranges, args.c
-        if any((*others, args.samples)):
+        if asked or any((args.onto, args.alone, args.servo, args.ranges, args.samples)):
             raise UsageError("--lerobot is for a recording and goes with no other file")
         return
     if args.samples is not None and (args.servo is not None or args.samples < 1):
         raise UsageError("--samples N (1 or more) are drawn from a learned model, not of --servo")
-    if args.samples is not None and args.urdf is None and args.mjcf is None:
+    if args.samples is not None and not asked.keys() - {"c"}:
         raise UsageError("--samples need a folder: --urdf FOLDER, --mjcf FOLDER")
     if args.servo is not None:
         options.check_robot(str(args.model))
+        if asked.keys() - {"urdf", "mjcf"}:
+            raise UsageError("--servo goes with --urdf FILE and --mjcf FILE")
     elif args.model.suffix != ".json":
         raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
-    if args.onto is None:
-        if all(x is None for x in (args.urdf, args.mjcf, args.ranges, args.c)):
-            have = "--urdf FILE, --mjcf FILE, --onto INPUT, --ranges FILE, --c FILE"
-            raise UsageError(f"nothing to write; have: {have}")
-    elif args.onto.suffix not in (".urdf", ".xml"):
-        raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
-    elif args.urdf is None and args.mjcf is None:
-        path = args.onto.with_suffix(f".learned{args.onto.suffix}")
-        args.urdf, args.mjcf = (path, None) if path.suffix == ".urdf" else (None, path)
-    elif (args.urdf if args.onto.suffix == ".urdf" else args.mjcf) is None:
-        other = "--urdf" if args.onto.suffix == ".urdf" else "--mjcf"
-        raise UsageError(f"--onto {args.onto} is written by {other} FILE")
-    for option, path, other in (("--urdf", args.urdf, ".xml"), ("--mjcf", args.mjcf, ".urdf")):
-        if path is not None and path.suffix == other:
-            raise UsageError(f"{option} {path}: have: --urdf FILE.urdf, --mjcf FILE.xml")
+    if args.onto is None and not asked and args.ranges is None:
+        have = ", ".join(f"--{kind} FILE" for kind in FORMATS)
+        raise UsageError(f"nothing to write; have: {have}, --onto INPUT, --ranges FILE")
+    if args.onto is not None:
+        ends = args.onto.suffix[:4]  # of .usda and .usdc as of .usd
+        kind = {".urd": "urdf", ".xml": "mjcf", ".usd": "usd"}.get(ends)
+        if kind is None:
+            raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml), a .usd")
+        if not asked.keys() & {"urdf", "mjcf", "usd"}:
+            asked[kind] = args.onto.with_suffix(f".learned{FORMATS[kind][0]}")
+            setattr(args, kind, asked[kind])
+        elif kind not in asked:
+            raise UsageError(f"--onto {args.onto} is written by --{kind} FILE")
+    for kind, path in asked.items():
+        if path.suffix in {x for x, _ in FORMATS.values()} - {FORMATS[kind][0]}:
+            have = ", ".join(f"--{x} FILE{ends}" for x, (ends, _) in FORMATS.items())
+            raise UsageError(f"--{kind} {path}: have: {have}")
     options.check_files(args.model if args.servo is None else None, args.servo, args.onto)
 
 

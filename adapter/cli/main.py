@@ -64,7 +64,11 @@ COMMANDS = {  # in the order of --help
     "gap": Command(
         model_options.declare_gap, "find what a model lacks", begins="comparing {model} with {logs}"
     ),
-    "effects": Command(model_options.declare_effects, "what can be named, and laws of one's own"),
+    "effects": Command(
+        model_options.declare_effects,
+        "what can be named, and laws of one's own",
+        "adapter.cli.files:run_effects",
+    ),
     "fleet": Command(
         model_options.declare_fleet,
         "one model per arm from many recordings",
@@ -100,7 +104,7 @@ COMMANDS = {  # in the order of --help
     ),
     "export": Command(
         files_options.declare_export,
-        "write a model file as URDF",
+        "write a model for simulators",
         "adapter.cli.results:run_export",
         begins="reading {model}",
     ),

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from adapter.errors import UsageError
-from adapter.model.robot_names import ROBOT_FILES, robot_names
+from adapter.model import ROBOT_FILES, robot_names
 from drivers.errors import choices
 from drivers.files.names import RECORDINGS, is_recording
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,10 +14,10 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from adapter.cli.exit_codes import ExitCode
+from adapter.cli.files_options import FORMATS
 from adapter.effects.active import check_effects, with_bodies
-from adapter.effects.c_text import c_text
 from adapter.effects.ranges import ranges
-from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_urdf
+from adapter.effects.robots import read_robot, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.gap.servo_files import servo_mjcf, servo_urdf
@@ -31,14 +31,13 @@ from adapter.report.next_steps import next_steps
 from adapter.report.trust import headline
 from adapter.report.words import NOT_WATCHED, not_learned, small
 from adapter.report.worth import Worth
+from adapter.runs.library import EXPORTED
 from adapter.runs.outcome import Outcome
 from adapter.runs.run_folder import RunData, load_run, run_data, save_run
 from adapter.runs.score import Reference, counted_from
 from adapter.runs.terminal import json_ready, output, program_version, show, warn, write_json
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.lerobot import write_lerobot
-
-SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml", "c": ".c"}
 
 
 class Learned(NamedTuple):
@@ -169,25 +168,10 @@ def write_urdf(model: SelfModel, path: Path, whose: str = "", told: bool = False
     except ModelError as error:
         warn([f"{whose}no URDF: {error}"])
         return False
-    if told:
-        write_robot(path, written)
-    else:
-        path.write_bytes(written.text.encode())
-    return True
-
-
-def write_robot(path: Path, written: RobotText) -> None:
-    """Write a robot's file; warns of what it lacks."""
     path.write_bytes(written.text.encode())
-    warn(shortcomings(path, written))
-
-
-def shortcomings(path: Path, written: RobotText) -> list[str]:
-    """What a robot's file lacks, and what else is to be said of it."""
-    lacking, listed = [], ", ".join(written.left_out)
-    if written.onto is None and listed:
-        lacking = [f"{path} has no full place for {listed}; a comment in it lists what is missing"]
-    return [*lacking, *(f"{path}: {note}" for note in written.notes)]
+    if told:
+        warn([f"{path}: {what}" for what in (written.lacks, *written.notes) if what])
+    return True
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -197,39 +181,41 @@ def run_export(args: argparse.Namespace) -> int:
         write_json(args.json, {"lerobot": str(args.lerobot)})
         show(str(args.lerobot))
         return 0
-    writers: list[Callable[..., RobotText]] = [robot_urdf, robot_mjcf]
+    writers = {kind: EXPORTED[ends] for kind, (ends, _) in FORMATS.items()}
     if args.servo is None:
         model = check_effects(load_model(args.model), args.model)
     else:
         model = read_robot(str(args.model))
         servos = read_servos(args.servo, model.tree.joint_names)
-        writers = [partial(write, servos=servos) for write in (servo_urdf, servo_mjcf)]
+        with_servos = {"urdf": servo_urdf, "mjcf": servo_mjcf}
+        writers = {kind: partial(write, servos=servos) for kind, write in with_servos.items()}
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):
         facts[key] = list(model.provenance.get(key, ()))
-    paths = args.urdf, args.mjcf, args.c
-    writers.append(lambda model, **_: c_text(model))
     drawn = [] if args.samples is None else with_bodies(model).sample(args.samples, args.seed)
-    for kind, path, text_of in zip(SUFFIXES, paths, writers, strict=True):
+    for kind, text_of in writers.items():
+        path, ends = getattr(args, kind), FORMATS[kind][0]
         if path is None:
             continue
-        fits = args.onto is not None and args.onto.suffix == SUFFIXES[kind]
+        fits = args.onto is not None and args.onto.suffix[:4] == ends[:4]
         write = partial(text_of, onto=args.onto if fits else None, alone=args.alone)
         written = write(model)
         if args.samples is None or kind == "c":
-            write_robot(path, written)
+            path.write_bytes(written.text.encode())
         else:
             path.mkdir(parents=True, exist_ok=True)
             for number, own in enumerate(drawn):
-                file = path / f"{number:04d}{SUFFIXES[kind]}"
+                file = path / f"{number:04d}{ends}"
                 file.write_bytes(write(own).text.encode())
-            warn(shortcomings(path, written))
+        warn([f"{path}: {note}" for note in written.notes])
         facts[kind] = str(path)
         facts["onto"] = facts.get("onto") or written.onto
         facts["left_out"] = sorted({*facts.get("left_out", ()), *written.left_out})
         facts["notes"] = [*facts.get("notes", ()), *written.notes]
         onto = "" if written.onto is None else f" onto {written.onto}"
         show(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
+        if written.lacks:
+            show(f"  {written.lacks}")
     if args.ranges is not None:
         found = ranges(model)
         write_json(args.ranges, found)

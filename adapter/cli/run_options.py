@@ -9,7 +9,7 @@ from pathlib import Path
 from adapter.cli import options
 from adapter.control.settings import DESIGNED, KINDS
 from adapter.errors import UsageError
-from adapter.model.robot_names import robot_names
+from adapter.model import robot_names
 from drivers.errors import choices
 from drivers.registry import OWN_KIND, SCHEMES, is_own, split_address, tells_no_robot
 

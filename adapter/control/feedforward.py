@@ -111,7 +111,8 @@ class ModelFeedforward(Feedforward):
         self._effects = effects_by_name(effect_names)
         self._units = [_shares_of_effect(effect) for effect in self._effects]
         self._known, self._shares = _split(known, n)
-        self.table, self._still = joint_table(n), np.zeros(n)
+        self.table, self._still = np.zeros((Row.END, n)), np.zeros(n)
+        self.table[Row.PLACE] = np.nan  # bristles that nobody has seen
         self._q, self._dq, self._ddq, self._tau = self.table[: Row.TAU + 1]
         # position, velocity, acceleration, torque of the links: a table of one instant each
         self._links = np.zeros((4, 1, n))
@@ -281,13 +282,6 @@ class Row(IntEnum):
     BENT = 7 + WAYS
     SHARES = 7 + 2 * WAYS  # of the columns
     END = 7 + 2 * WAYS + COLUMNS
-
-
-def joint_table(n: int) -> Array:
-    """Of n joints without effects, whose bristles nobody has seen."""
-    table = np.zeros((Row.END, n))
-    table[Row.PLACE] = np.nan
-    return table
 
 
 def shares_of(torque: Callable[[JointSignals], Array | float], n: int) -> Array | None:

@@ -309,11 +309,7 @@ class ContactObserver:
         contacts: all so far, at most `MOST_CONTACTS`.
     """
 
-    def __init__(
-        self,
-        documented: SelfModel,
-        effect_names: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, documented: SelfModel, effect_names: Sequence[str] = ()) -> None:
         n = documented.tree.n
         effort = documented.limits.effort
         self._model = ModelFeedforward.of(documented)

@@ -12,7 +12,7 @@ from adapter.effects import base
 from adapter.effects.base import Array, JointSignals, Motion, Values
 from adapter.effects.by_joint import WAYS_RAD, shares_of_ways
 from adapter.effects.phrases import SPEEDS, STILL, TURNS, Phrase
-from adapter.model.urdf_text import FRICTION, Additions
+from adapter.model.urdf_text import BREAKAWAY, FRICTION, Additions
 
 USUAL_RAD, TIMES = 1.5e-3, 3.0  # and by what factor it is off: a real Panda, a KUKA LWR4
 WAY = base.Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
@@ -59,8 +59,12 @@ class Rubs(base.JointTorque):
         return float(values["s0"]) if "s0" in values else None
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """The level in motion, as dry friction."""
-        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
+        """The level in motion, as dry friction; at rest where the format knows both."""
+        part = "Fc is there as the joint's friction"
+        rest = float(values.get("Fs", values["Fc"])) - float(values["Fc"])
+        if rest and more.at_joint(BREAKAWAY, joint, rest) is None:
+            part = "Fs holds the joint, and Fc is its friction once it slides"
+        return more.at_joint(FRICTION, joint, values["Fc"], part)
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The level times z, which is zero before the motion; of rows apart as if each slid."""

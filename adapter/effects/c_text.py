@@ -16,13 +16,14 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from adapter.effects.active import Active, lasting_effects, with_bodies
-from adapter.effects.base import JointTorque
+from adapter.effects.base import BodyEffect, JointTorque
 from adapter.effects.bristle_friction import Rubs
 from adapter.effects.by_joint import DRUM_M, JointSignals
 from adapter.effects.law import OverSignals
-from adapter.effects.robots import RobotText
+from adapter.effects.robots import RobotText, in_words, kept_lines
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel, theta_doubt
+from adapter.model.urdf_text import NO_PLACE, Kept
 from adapter.physics.kernels import (
     JointMotion,
     base_at_rest,
@@ -148,7 +149,7 @@ def _plain(kernel: Any) -> Callable[..., Any]:
     )
 
 
-def c_text(model: SelfModel) -> RobotText:
+def c_text(model: SelfModel, onto: None = None, alone: bool = True) -> RobotText:
     """The arm's torque in C99: `adapter_torque` and its parts, without allocation.
 
     Raises:
@@ -158,20 +159,22 @@ def c_text(model: SelfModel) -> RobotText:
         raise ModelError(f"{model.name}: its base floats; C is written of fixed-base arms")
     bare = with_bodies(model)
     laws = _Laws(bare)
+    acting = lasting_effects(model.effects, model.tree.n)
+    bodies = {x.effect.name: None for x in acting if isinstance(x.effect, BodyEffect)}
+    kept = (*(Kept(name, "", None) for name in bodies), *laws.kept)
     told = [
         f"The torque of {model.name}, written by `adapter export --c`.",
         f"Joints, in order: {', '.join(model.tree.joint_names)}.",
         *[f"theta: {theta_doubt(model)}"] * bool(theta_doubt(model)),
-        "In it: the bodies with tool, load and mounting, and of each joint: "
-        + (", ".join(laws.held) or "nothing"),
-        "Not in it, as it is of sensors, encoders or time: " + (", ".join(laws.left_out) or "-"),
+        "In it: the bodies with tool, load and mounting, and of effects:",
+        *(f"  {line}" for line in kept_lines(kept)),
     ]
     n, bent = model.tree.n, laws.bent
     steps = (f"q[{j}] - state->q[{j}], {s0!r}" for j, s0 in bent)
     slots = ((f"state->bent[{k}]", step) for k, step in enumerate(steps))
     wind = [f"        {slot} = adapter_wound({slot}, {step});" for slot, step in slots]
     parts = {
-        "HEAD": "\n".join(" * " + " ".join(line.split()).replace("*/", "* /") for line in told),
+        "HEAD": "\n".join(" * " + " ".join(x.splitlines()).replace("*/", "* /") for x in told),
         "JOINTS": str(n),
         "BENT": str(max(len(bent), 1)),
         "RIGID": _rigid(bare),
@@ -181,7 +184,7 @@ def c_text(model: SelfModel) -> RobotText:
     text = TEMPLATE.read_text(encoding="utf-8")
     for key, part in parts.items():
         text = text.replace(f"@{key}@", part)
-    return RobotText(text, None, tuple(laws.left_out), ())
+    return RobotText(text, None, kept, ())
 
 
 def _rigid(model: SelfModel) -> str:
@@ -201,7 +204,7 @@ class _Laws:
     """C of what a model's joints have beside the bodies.
 
     Attributes:
-        body: of it; held, left_out: names of the effects in it and of the others.
+        body: of it; kept: how much of which effect is in it.
         bent: joint (from 0) and way s0 (rad) of each friction with bristles.
     """
 
@@ -213,18 +216,17 @@ class _Laws:
         self._joints = [JointSignals(*x[:4], drum=x[4]) for x in each]
         self._program, self.bent = program, list[tuple[int, float]]()
         sums: list[Any] = [0.0] * n
-        held, left_out = dict[str, None](), dict[str, None]()
+        self.kept: list[Kept] = []
         for active in lasting_effects(model.effects, n):
-            if not any(map(np.any, active.values.values())):
-                continue
+            part = None
             try:
-                sums[active.joint] = sums[active.joint] + self._torque(active)
-                held[active.effect.name] = None
+                if any(map(np.any, active.values.values())):
+                    sums[active.joint] = sums[active.joint] + self._torque(active)
             except TypeError:  # no law of a joint's signals, or one that C does not hold
-                if active.shown:
-                    left_out[active.effect.name] = None
+                part = NO_PLACE
+            if part is None or active.shown:
+                self.kept.append(Kept(active.effect.name, in_words(active, model.tree), part))
         self.body = program.body("tau", sums, "+=")
-        self.held, self.left_out = list(held), list(left_out)
 
     def _torque(self, active: Active) -> Traced | float:
         """A law of one joint. Raises TypeError where it is none that C can hold."""

@@ -60,11 +60,12 @@ def ranges(model: SelfModel) -> dict[str, Any]:
         of_joint = np.sqrt(np.mean((ways[:, k] @ errors).reshape(INSTANTS, -1) ** 2, axis=0))
         told = {"torque_share": float(share[k]), "torque_nm": of_joint.tolist()}
         directions.append(told | table.written(slopes.T @ ways[:, k]))
+    own = {f"{e} {key}": KNOWN[e].units()[key] for e, _, key in table.labels}  # of what turns
     return {
         "format": FORMAT,
         "version": 1,
         "model": model.name,
-        "units": table.units(),
+        "units": {key: unit for key, (unit, _) in PARTS.items()} | own,
         "mean": table.written(table.of(model)),
         "std": table.written(np.linalg.norm(slopes, axis=0)),
         "directions": directions,
@@ -76,7 +77,7 @@ class _Table:
 
     def __init__(self, model: SelfModel) -> None:
         self._tree = model.tree
-        self._labels = [number.label for number in doubted(model.effects)]
+        self.labels = [number.label for number in doubted(model.effects)]
         self._turns = [z_to_axis(axis) for axis in model.axis]
 
     def of(self, model: SelfModel) -> Array:
@@ -93,12 +94,7 @@ class _Table:
             parts = {key: row[at].tolist() for key, (_, at) in PARTS.items()}
             links[name] = {**parts, "mass": float(row[0])}
         joints: dict[str, dict[str, float]] = {}
-        for (effect, joint, key), value in zip(self._labels, values[10 * tree.n :], strict=True):
+        for (effect, joint, key), value in zip(self.labels, values[10 * tree.n :], strict=True):
             name = tree.joint_names[joint - 1] if joint else "all"
             joints.setdefault(name, {})[f"{effect} {key}"] = float(value)
         return {"links": links, "joints": joints}
-
-    def units(self) -> dict[str, str]:
-        """Of each number by its name; of a joint that slides m stands for rad, N for N m."""
-        own = {f"{e} {key}": KNOWN[e].units()[key] for e, _, key in self._labels}
-        return {**{key: unit for key, (unit, _) in PARTS.items()}, **own}

@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adapter.effects.active import Active, active_effects, check_effects
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import CATALOGUE, KNOWN
+from adapter.model.filled import MJCF_PLACES, PLACES, filled
 from adapter.model.mjcf import mjcf_onto, read_mjcf
-from adapter.model.mjcf_text import MJCF_PLACES, mjcf_text
 from adapter.model.robots import documented
-from adapter.model.self_model import MJCF, SelfModel, theta_doubt
+from adapter.model.self_model import MJCF, SelfModel, gravity_down, theta_doubt
+from adapter.model.tree import Tree
 from adapter.model.urdf import file_text, urdf_onto
-from adapter.model.urdf_text import STIFFNESS, URDF_PLACES, Additions, unplaced, urdf_text
+from adapter.model.urdf_text import NO_PLACE, STIFFNESS, Additions, Kept
+from adapter.model.usd import usd_onto
 from adapter.model.xml_edit import XmlText
 
 
@@ -65,14 +67,42 @@ class RobotText:
     Attributes:
         text: of the file.
         onto: the file it was written onto, None where the arm stands alone.
-        left_out: names of the effects that the format has no place for, or not for all of them.
+        kept: how much of which effect is in it.
         notes: what a user should know of it, in words.
     """
 
     text: str
     onto: str | None
-    left_out: tuple[str, ...]
+    kept: tuple[Kept, ...]
     notes: tuple[str, ...]
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the effects that the format has no place for, or not for all of them."""
+        return tuple(sorted({x.effect for x in self.kept if x.part is not None}))
+
+    @property
+    def lacks(self) -> str:
+        """The same in one sentence; nothing where all is in it."""
+        rows = {x.effect: KNOWN[x.effect].title for x in self.kept}
+        gone = {x.effect for x in self.kept if x.part == NO_PLACE}
+        partly = [rows[name] for name in self.left_out if name not in gone]
+        said = [f"drops {', '.join(rows[name] for name in sorted(gone))}"] * bool(gone)
+        said += [f"holds in part {', '.join(partly)}"] * bool(partly)
+        more = " (numbers: its first lines; formats: docs/simulate-what-was-learned.md)"
+        return "; ".join(said) + more * bool(said)
+
+
+def kept_lines(kept: Sequence[Kept]) -> list[str]:
+    """A line for each effect and how much of it a file holds, with its numbers where not all."""
+    found = dict[tuple[str, str | None], list[str]]()
+    for one in kept:
+        found.setdefault((one.effect, one.part), []).append(one.of)
+    lines = []
+    for (name, part), own in found.items():
+        how = "whole" if part is None else part or "no"
+        lines += [f"{KNOWN[name].title}: {how}", *(f"  {x}" for x in own if part is not None)]
+    return lines
 
 
 def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = False) -> RobotText:
@@ -86,26 +116,14 @@ def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     Raises:
         ModelError: a URDF that is not the model's, or where a body is physically impossible.
     """
-    more, source = additions(model, URDF_PLACES), model.source
-    left_out = tuple(more.names)
+    more, source = additions(model, PLACES["urdf"]), model.source
     if onto is not None:
         text, file = file_text(onto), str(onto)
     elif source is not None and source.text is not None and not alone:
         text, file = source.text, source.file
     else:
-        return _doubted(model, RobotText(urdf_text(model, more), None, left_out, ()))
-    written, notes = urdf_onto(model, more, text, file)
-    lacking = _lacking("a URDF", unplaced(model, more))
-    return _doubted(model, RobotText(written, file, left_out, (*notes, *lacking)))
-
-
-def to_urdf(model: SelfModel) -> str:
-    """URDF text of the arm alone with its effects, as far as a URDF goes (see `model.urdf_text`).
-
-    Raises:
-        ModelError: where a body is physically impossible; names the link and the eigenvalue.
-    """
-    return urdf_text(model, additions(model, URDF_PLACES))
+        return _with_head(model, more, "urdf", filled("urdf", model, more))
+    return _with_head(model, more, "urdf", *urdf_onto(model, more, text, file), file)
 
 
 def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = False) -> RobotText:
@@ -114,32 +132,65 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     Raises:
         ModelError: as there, and where MuJoCo, which reads an MJCF, is not installed.
     """
-    more, source = additions(model, tuple(MJCF_PLACES)), model.source
-    left_out, notes = tuple(more.names), list[str]()
+    more, source, notes = additions(model, PLACES["mjcf"]), model.source, list[str]()
     if onto is None and source is not None and source.format == MJCF and not alone:
         onto = source.file
         if not Path(onto).exists():
             notes = [f"{onto}, which the model came from, is not there; this is the arm alone"]
             onto = None
     if onto is None:
-        return _doubted(model, RobotText(mjcf_text(model, more), None, left_out, tuple(notes)))
-    written, notes = mjcf_onto(model, more, onto)
-    notes += _lacking("an MJCF", more.left_out)
-    return _doubted(model, RobotText(written, str(onto), left_out, tuple(notes)))
+        return _with_head(model, more, "mjcf", filled("mjcf", model, more), notes)
+    return _with_head(model, more, "mjcf", *mjcf_onto(model, more, onto), str(onto))
 
 
-def _doubted(model: SelfModel, written: RobotText) -> RobotText:
-    """The same with what is to be said of the model's θ, as a comment in the file and a note."""
-    if not theta_doubt(model):
-        return written
-    xml, doubt = XmlText(written.text, model.name), f"θ: {theta_doubt(model)}"
-    xml.remark(doubt)
-    return replace(written, text=xml.text(), notes=(*written.notes, doubt))
+def robot_text(
+    kind: str, model: SelfModel, onto: str | Path | None = None, alone: bool = True
+) -> RobotText:
+    """SDF, USD or Isaac Lab's actuators of the arm alone with its effects.
+
+    Args:
+        kind: of `filled.PLACES`; onto: of USD, an asset that the text is a layer over.
+
+    Raises:
+        ModelError: as `robot_urdf`; MeansError: an asset, and usd-core is not installed.
+    """
+    more = additions(model, PLACES[kind])
+    if onto is None:
+        return _with_head(model, more, kind, filled(kind, model, more))
+    return _with_head(model, more, kind, *usd_onto(model, more, onto), str(onto))
 
 
-def _lacking(kind: str, left_out: Sequence[str]) -> list[str]:
-    """What a format has no place for, in one sentence."""
-    return [f"{kind} has no place for {'; '.join(left_out)}"] if left_out else []
+def _with_head(
+    model: SelfModel,
+    more: Additions,
+    kind: str,
+    text: str,
+    notes: Sequence[str] = (),
+    onto: str | None = None,
+) -> RobotText:
+    """The text with a comment first in it: how much of which effect it holds, and doubt of θ.
+
+    None where it holds all: what is written onto a file then leaves it as it is but for numbers.
+    """
+    doubt, missing = theta_doubt(model), list(more.left_out)
+    if kind != "mjcf" and not np.array_equal(model.gravity, gravity_down()):
+        missing.append(f"gravity {model.gravity.tolist()} m/s2 in base axes")
+    said = [f"no place for {x}" for x in missing] + [f"θ: {doubt}"] * bool(doubt)
+    lines = [
+        f"what this {kind.upper()} holds of the effects of {model.name}",
+        *kept_lines(more.kept),
+    ]
+    if all(x.part is None for x in more.kept) and not said:
+        lines = []
+    lines += said
+    if text.lstrip().startswith("<"):
+        xml = XmlText(text, model.name)
+        xml.remark(lines)
+        text = xml.text()
+    else:
+        head = "\n".join("# " + " ".join(x.splitlines()) for x in lines or [model.name])
+        text = text.replace("#@HEAD@", head, 1)
+    return RobotText(text, onto, tuple(more.kept), (*notes, *said))
 
 
 def additions(model: SelfModel, places: Sequence[str]) -> Additions:
@@ -148,39 +199,29 @@ def additions(model: SelfModel, places: Sequence[str]) -> Additions:
     Numbers that are no more than noise are written where they have a place, and not missed where
     they have none.
     """
-    acting = active_effects(model.effects, model.tree.n)
-    more = _additions(model, places, acting)
-    shown = _additions(model, places, [active for active in acting if active.shown])
-    more.left_out, more.names = shown.left_out, shown.names
-    return more
-
-
-def _additions(model: SelfModel, places: Sequence[str], acting: Sequence[Active]) -> Additions:
-    more, names = Additions(model.tree.n, model.tree.floating, tuple(places)), set()
-    for active in acting:
-        note = "it ended"
+    more, shown = Additions(model.tree.n, model.tree.floating, tuple(places)), set[int]()
+    for active in active_effects(model.effects, model.tree.n):
+        part: str | None = NO_PLACE
         if active.lasting:
             part = active.effect.export(more, active.joint, active.values)
-            if part is None or not any(map(np.any, active.values.values())):
-                continue
-            note = part
-        slides = active.joint >= 0 and model.tree.slides[active.joint]
-        name, units = active.effect.name, active.effect.units(slides)
-        where = "" if active.joint < 0 else f" of {model.tree.joint_names[active.joint]}"
-        numbers = [f"{key} = {_number(x)} {units[key]}" for key, x in active.values.items()]
-        said = f"{name}{where}, {', '.join(numbers)}"
-        more.left_out.append(said + (f" ({note})" if note else ""))
-        names.add(name)
+            part = part if any(map(np.any, active.values.values())) else None
+        if active.shown:
+            shown.add(active.joint)
+        if active.shown or part is None:
+            more.kept.append(Kept(active.effect.name, in_words(active, model.tree), part))
     for what, table in more.joint.items():  # no format takes negative losses
         for j in np.flatnonzero(table < 0.0) if what != STIFFNESS else ():
-            name = model.tree.joint_names[j]
-            more.left_out.append(f"{what} of {name}, which is negative: {table[j]:g}")
+            if j in shown:
+                told = f"{what} of {model.tree.joint_names[j]}, which is negative: {table[j]:g}"
+                more.left_out.append(told)
             table[j] = 0.0
-    more.names = sorted(names)
     return more
 
 
-def _number(value: object) -> str:
-    if isinstance(value, int | float):
-        return f"{value:.4g}"
-    return str([float(f"{x:.4g}") for x in np.ravel(np.asarray(value, float))])
+def in_words(active: Active, tree: Tree) -> str:
+    """The joint that an effect has, and its numbers."""
+    units = active.effect.units(active.joint >= 0 and tree.slides[active.joint])
+    where = "" if active.joint < 0 else f"{tree.joint_names[active.joint]}: "
+    told = {key: np.vectorize("{:.4g}".format)(x).tolist() for key, x in active.values.items()}
+    said = [f"{key} = {x} {units[key]}".replace("'", "") for key, x in told.items()]
+    return where + ", ".join(said) + (" (it ended)" if not active.lasting else "")

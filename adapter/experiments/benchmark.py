@@ -20,7 +20,7 @@ import torch
 from rich.table import Table
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.robots import read_robot, to_urdf
+from adapter.effects.robots import read_robot, robot_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
@@ -168,7 +168,7 @@ def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
         return _row(what, None, "pin is not installed")
     import pinocchio
 
-    model = pinocchio.buildModelFromXML(to_urdf(robot))
+    model = pinocchio.buildModelFromXML(robot_urdf(robot, alone=True).text)
     data = model.createData()
     q, dq, ddq, tau = motion(robot, repeats)
     n = model.nv
@@ -195,7 +195,7 @@ def _peer(repeats: int) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "panda.urdf"
-        path.write_text(to_urdf(documented("panda")))
+        path.write_text(robot_urdf(documented("panda"), alone=True).text)
         model = DifferentiableRobotModel(os.fspath(path), device="cpu")
     for k in range(1, 8):
         mass = UnconstrainedTensor(dim1=1, dim2=1)
@@ -280,7 +280,7 @@ def _errors(robot: SelfModel, learned: Signals, unseen: Signals) -> Array:
 
     with tempfile.TemporaryDirectory() as folder:
         urdf, settings = Path(folder) / "arm.urdf", Path(folder) / "settings.yaml"
-        urdf.write_text(to_urdf(robot))
+        urdf.write_text(robot_urdf(robot, alone=True).text)
         settings.write_text(_settings(robot))
         arm = load_robot(os.fspath(urdf), load_by_urdf=True)
         work = Identification(arm, os.fspath(settings))

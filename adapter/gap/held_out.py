@@ -41,10 +41,7 @@ WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
 def model_of(
-    model: SelfModel,
-    fit: Fit,
-    recording: int | None = None,
-    known: Carried | Moments | None = None,
+    model: SelfModel, fit: Fit, recording: int | None = None, known: Carried | Moments | None = None
 ) -> SelfModel:
     """The self model with the corrections and the named effects of a fit; see `entries`."""
     theta = model.theta.copy()

@@ -37,12 +37,7 @@ from adapter.gap.signals import (
 )
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.screening.screen import (
-    RecordingFault,
-    RecordingRefused,
-    at_source,
-    of_this_robot,
-)
+from adapter.screening.screen import RecordingFault, RecordingRefused, at_source, of_this_robot
 from adapter.screening.timing import RecordingClock, check_timing, joined, lateness, uniform
 from drivers.files.mcap import Log, mapped
 from drivers.files.rows import RowsFile, stretches

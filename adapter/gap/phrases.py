@@ -15,12 +15,7 @@ from adapter.gap.result import Finding
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import plain, plus_minus
 
-SHOWN_UNITS = {
-    "1": (100.0, "%"),
-    "s": (1e3, "ms"),
-    "s2": (1e6, "ms²"),
-    "m": (1e3, "mm"),
-}
+SHOWN_UNITS = {"1": (100.0, "%"), "s": (1e3, "ms"), "s2": (1e6, "ms²"), "m": (1e3, "mm")}
 
 
 def measured(value: Any, std: Any, unit: str) -> str:

@@ -18,7 +18,6 @@ from adapter.gap.servo_kernels import SLIP
 from adapter.gap.servo_model import ServoModel
 from adapter.model.mjcf_drives import Drives, Floor, with_drives
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 
 EFFECTS = {  # by name: its parameter, and where the servos have it
@@ -45,24 +44,20 @@ def drives_of(servos: ServoModel, model: SelfModel) -> Drives:
     ground, floor = servos.ground, None
     if ground.root > 0.0:
         floor = Floor(*ground[:4], ground.root**2, ground.rubs)
-    damping = servos.velocity_gain + servos.viscous
+    damping, n = servos.velocity_gain + servos.viscous, model.tree.n
+    arm, still = RigidArm.of(model).changed(gravity=np.zeros(3)), np.zeros((n, n))
+    own_inertia = np.diagonal(arm.torque(still, still, np.eye(n)))  # kg m², at zero
     return Drives(
         servos.position_gain,
         servos.velocity_gain,
         servos.torque_limit,
         servos.feeds_speed,
-        damping / (own_inertia(model) + servos.armature),
+        damping / (own_inertia + servos.armature),
         servos.stiction,
         SLIP,
         servos.delay_s,
         floor,
     )
-
-
-def own_inertia(model: SelfModel) -> Array:
-    """(n,) kg m² that each joint alone moves, at zero."""
-    arm, n = RigidArm.of(model).changed(gravity=np.zeros(3)), model.tree.n
-    return np.diagonal(arm.torque(np.zeros((n, n)), np.zeros((n, n)), np.eye(n)))
 
 
 def servo_mjcf(
@@ -83,10 +78,7 @@ def servo_mjcf(
     lacks = [
         f"the {what} of joint {numbered((np.flatnonzero(sizes) + 1).tolist())} is not in it: no "
         "field of MuJoCo's holds it; our own simulation has it"
-        for what, sizes in (
-            ("dead band", servos.dead_band),
-            ("backlash", servos.backlash),
-        )
+        for what, sizes in (("dead band", servos.dead_band), ("backlash", servos.backlash))
         if sizes.any()
     ]
     return replace(written, text=text, notes=(*written.notes, *notes, *lacks))

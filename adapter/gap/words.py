@@ -29,13 +29,7 @@ MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
 WIDER = "move the joint faster, and over a wider range"  # what tells one curve from another
 NOT_EXPLAINED = "are not explained by any effect of the catalogue"
-SIGNALS = {
-    "dq": "velocity",
-    "ddq": "acceleration",
-    "q": "position",
-    "tau": "load",
-    "t": "time",
-}
+SIGNALS = {"dq": "velocity", "ddq": "acceleration", "q": "position", "tau": "load", "t": "time"}
 
 
 def headline(result: GapResult) -> str:

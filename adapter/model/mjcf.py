@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adapter import optional
 from adapter.errors import ModelError, ModelWarning
 from adapter.model import spatial
-from adapter.model.inertia import move_theta, theta_from_body
-from adapter.model.mjcf_text import MJCF_PLACES, inertial_attributes, joint_attributes
+from adapter.model.filled import MJCF_PLACES, joint_attributes, principal
+from adapter.model.inertia import body_from_theta, move_theta, theta_from_body
 from adapter.model.onto import Changes, changes_onto
 from adapter.model.robot_file import FileJoint, FileRobot, Merged
 from adapter.model.self_model import MJCF, SelfModel, Source
@@ -101,13 +102,7 @@ def compiled_mjcf(path: str | Path, text: str | None = None) -> Any:
     if top != "mujoco":
         is_urdf = "; a URDF's name ends in .urdf" if top == "robot" else ""
         raise ModelError(f"{path}: top element is <{top}>, an MJCF has <mujoco>{is_urdf}")
-    try:
-        import mujoco
-    except ImportError:
-        raise ModelError(
-            f"{path}: an MJCF is read by MuJoCo, which is not installed; have: "
-            "pip install 'panda-adapter[mujoco]', or a URDF"
-        ) from None
+    mujoco = optional.load("mujoco")
     try:
         if text is None:
             return mujoco.MjModel.from_xml_path(str(path))
@@ -338,7 +333,10 @@ class _Writer:
     def _body(self, name: str, theta: spatial.Array) -> None:
         """<inertial> of a body, from θ (10,) in its link's frame."""
         element, body = self._element(name), self.file.compiled.body(name).id
-        values = inertial_attributes(move_theta(theta, np.eye(3), self.file.anchor[body]))
+        mass, com, tensor = body_from_theta(move_theta(theta, np.eye(3), self.file.anchor[body]))
+        moments, axes = principal(tensor)
+        told = {"pos": com, "quat": axes, "mass": mass, "diaginertia": moments}
+        values = {key: number_text(value) for key, value in told.items()}
         inertial = element.child("inertial")
         if inertial is None:
             texts = " ".join(f'{key}="{value}"' for key, value in values.items())

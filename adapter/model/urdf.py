@@ -295,14 +295,9 @@ def _write_inertial(xml: XmlText, link: Element, theta: Array) -> None:
     inertial = link.child("inertial")
     if inertial is None:
         six = " ".join(f'{key}="{number_text(x)}"' for key, x in six_named(tensor).items())
-        lines = (
-            "<inertial>",
-            f'  <origin xyz="{number_text(com)}"/>',
-            f'  <mass value="{number_text(mass)}"/>',
-            f"  <inertia {six}/>",
-            "</inertial>",
-        )
-        xml.insert(link, "\n".join(lines))
+        centre, mass_kg = number_text(com), number_text(mass)
+        inside = f'<origin xyz="{centre}"/>\n  <mass value="{mass_kg}"/>\n  <inertia {six}/>'
+        xml.insert(link, f"<inertial>\n  {inside}\n</inertial>")
         return
     origin, axes = inertial.child("origin"), np.eye(3)
     if origin is not None:

@@ -1,4 +1,4 @@
-"""A self model as URDF text, with the joint axes that its source had.
+"""A self model as a robot's file has it, with the joint axes that its source had.
 
 What effects add to the arm comes in a record that knows nothing of them; `effects.robots` fills it.
 """
@@ -6,9 +6,8 @@ What effects add to the arm comes in a record that knows nothing of them; `effec
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
-from xml.sax.saxutils import quoteattr
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,24 +15,38 @@ from numpy.typing import ArrayLike
 from adapter.errors import ModelError
 from adapter.model.inertia import (
     CONSISTENCY_TOLERANCE,
-    body_from_theta,
     is_consistent,
     min_eigenvalue,
     six_from_tensor,
 )
-from adapter.model.self_model import LIMITS, SelfModel, base_inertia, gravity_down, turned_theta
-from adapter.model.spatial import Array, at_joints, rpy_from_matrix, z_to_axis
+from adapter.model.robot_file import SLIDING, FileJoint, FileRobot
+from adapter.model.self_model import LIMITS, URDF, SelfModel, Source, base_inertia, turned_theta
+from adapter.model.spatial import Array, at_joints, quaternion_from_matrix, z_to_axis
 from adapter.model.tree import BASE
 
 # What a joint of a file may have beside its limits; a format has some of them.
-DAMPING, FRICTION, ARMATURE, STIFFNESS = "damping", "friction", "armature", "stiffness"
-URDF_PLACES = (DAMPING, FRICTION)
+# Breakaway is by how much more than friction it takes to begin to slide.
+DAMPING, FRICTION, BREAKAWAY = "damping", "friction", "breakaway"
+ARMATURE, STIFFNESS = "armature", "stiffness"
 NO_PLACE = ""
 SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # of a tensor, as URDF names them
 NO_INERTIA = """<inertial>
   <mass value="0"/>
   <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
 </inertial>"""
+
+
+class Kept(NamedTuple):
+    """How much of an effect a file holds.
+
+    Attributes:
+        effect: its name; of: the joint it has, and its numbers, in words.
+        part: None for all of it, else what is there in words, `NO_PLACE` for nothing.
+    """
+
+    effect: str
+    of: str
+    part: str | None
 
 
 @dataclass(eq=False)
@@ -50,14 +63,14 @@ class Additions:
         loads: (10,) each, bodies that the last link carries, in its frame.
         tilt: (3, 3) how the base stands, None where upright.
         told: places and joints that an effect spoke of, be it by zero.
-        left_out: what has no place, in words; names: of the effects in it, sorted.
+        kept: how much of which effect is in the file; left_out: what else has no place, in words.
     """
 
     n: int
     floating: bool
     places: tuple[str, ...]
+    kept: list[Kept] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
     loads: list[Array] = field(default_factory=list)
     told: set[tuple[str, int]] = field(default_factory=set)
     tilt: Array | None = None
@@ -90,102 +103,56 @@ class Additions:
         return bool(alone)
 
 
-def urdf_text(model: SelfModel, more: Additions) -> str:
-    """URDF text of a model; the inverse of `urdf.read_urdf` up to rounding.
+def as_file(model: SelfModel, more: Additions) -> FileRobot:
+    """The arm as a robot's file has it, parents first; what `robot_file.Merged` reads undone.
 
-    Each link frame is turned back to its original axis, frames that ride on links come out as
-    links of no mass on fixed joints (said in numbers: to a link without <inertial> PyBullet gives
-    1 kg), a tool and loads as links of their own. A comment lists what has no place.
-
-    Args:
-        model: the arm; more: what it has beside, `places` being `URDF_PLACES`.
+    Each link's frame is turned back to its original axis: R_file = Q_i R_ij Q_jᵀ, p_file = Q_i p.
+    Frames that ride on links come out as links of no mass on fixed joints, the tool and loads as
+    links of their own. How the base stands, and what joints have beside, stay in `more`.
 
     Raises:
         ModelError: where a body is physically impossible; names the link and the eigenvalue.
     """
-    tree, robot = model.tree, ET.Element("robot", name=model.name)
-    missing = unplaced(model, more)
-    if missing:
-        robot.append(ET.Comment(comment_text(missing)))
-    turns = {tree.base_name: np.eye(3)}
-    turns.update({name: z_to_axis(model.axis[k]) for k, name in enumerate(tree.link_names)})
-    base = base_inertia(model)
-    if tree.floating or np.any(base):
-        _add_link(robot, tree.base_name, base)
-    else:
-        _add_massless(robot, tree.base_name)
-    for k, name in enumerate(tree.link_names):
-        theta = model.theta[k - tree.n] + more.dtheta[k]
-        _add_link(robot, name, turned_theta(theta, turns[name]))
-        _add_joint(robot, model, k, turns, more)
+    tree, limits = model.tree, np.column_stack([getattr(model.limits, key) for key in LIMITS])
+    zero, turns = (model.joint_rotation(), model.lam[:, 3:]), {tree.base_name: np.eye(3)}
+    turned, placed = at_joints(*zero, -more.offset, tree.slides)  # q = q_measured - offset
+    links, joints = {tree.base_name: base_inertia(model)}, dict[str, FileJoint]()
+
+    def fix(name: str, parent: str, child: str, rotation: Array, position: Array) -> None:
+        own = name, "fixed", parent, child, rotation, position
+        joints[name] = FileJoint(*own, np.array([1.0, 0.0, 0.0]), np.full(4, math.nan), None)
+
+    for k, (name, joint) in enumerate(zip(tree.link_names, tree.joint_names, strict=True)):
+        parent = tree.base_name if tree.parent[k] == BASE else tree.link_names[tree.parent[k]]
+        turns[name] = z_to_axis(model.axis[k])
+        kind = "revolute" if np.isfinite(limits[k, :2]).all() else "continuous"
+        kind = SLIDING[0] if tree.slides[k] else kind
+        place = turns[parent] @ turned[k] @ turns[name].T, turns[parent] @ placed[k]
+        own = joint, kind, parent, name, *place, model.axis[k], limits[k], None
+        joints[joint] = FileJoint(*own)
+        links[name] = turned_theta(model.theta[k - tree.n] + more.dtheta[k], turns[name])
     for frame in model.frames:
-        _add_massless(robot, frame.name)
-        turn = turns[frame.parent]
-        joint = _joint(robot, frame.joint, "fixed", frame.parent, frame.name)
-        _add_origin(joint, turn @ frame.rotation, turn @ frame.position)
-    tool, loads = carried(model, more)
-    for link, name, theta in (*tool, *loads):
-        _add_link(robot, name, turned_theta(theta, turns[link]))
-        _add_origin(_joint(robot, f"{name}_joint", "fixed", link, name), np.eye(3))
-    if more.tilt is not None:
-        upright = f"{tree.base_name}_upright"
-        _add_massless(robot, upright)
-        _add_origin(_joint(robot, f"{upright}_joint", "fixed", upright, tree.base_name), more.tilt)
-    ET.indent(robot)
-    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
-
-
-Carried = list[tuple[str, str, Array]]  # link, name of a body on it, and θ (10,) in its frame
-
-
-def carried(model: SelfModel, more: Additions) -> tuple[Carried, Carried]:
-    """The tool where there is one, and the loads; in files they are bodies of their own."""
-    last, tool = model.tree.link_names[-1], Carried()
+        links[frame.name], turn = np.zeros(10), turns[frame.parent]
+        place = turn @ frame.rotation, turn @ frame.position
+        fix(frame.joint, frame.parent, frame.name, *place)
+    last, carried = tree.link_names[-1], list[tuple[str, str, Array]]()
     if model.tool is not None:
-        tool.append((model.tool_link, f"{model.tool_link}_tool", model.tool.theta()))
-    names = (f"{last}_payload_{k + 1}" if k else f"{last}_payload" for k in range(len(more.loads)))
-    return tool, [(last, name, load) for name, load in zip(names, more.loads, strict=True)]
+        carried.append((model.tool_link, f"{model.tool_link}_tool", model.tool.theta()))
+    for number, load in enumerate(more.loads):
+        carried.append((last, f"{last}_payload{f'_{number + 1}' if number else ''}", load))
+    for link, name, theta in carried:
+        links[name] = turned_theta(theta, turns[link])
+        fix(f"{name}_joint", link, name, np.eye(3), np.zeros(3))
+    for name, theta in links.items():
+        if np.any(theta) or name in tree.body_names:
+            check_possible(theta, name)
+    return FileRobot("", model.name, links, joints, Source(URDF, ""))
 
 
-def unplaced(model: SelfModel, more: Additions) -> list[str]:
-    """What a URDF has no place for, in words; its gravity is upright."""
-    if np.array_equal(model.gravity, gravity_down()):
-        return more.left_out
-    return [f"gravity {model.gravity.tolist()} m/s2 in base axes", *more.left_out]
-
-
-def comment_text(left_out: list[str]) -> str:
-    """Text of the comment; XML forbids two hyphens in a row in one."""
-    text = " This file has no place for: " + "; ".join(left_out) + " "
-    return text.replace("--", "- -")
-
-
-def number_text(values: ArrayLike) -> str:
+def number_text(values: ArrayLike, between: str = " ") -> str:
     """Numbers that read back unchanged; a negative zero loses its sign."""
     numbers = np.atleast_1d(np.asarray(values, dtype=np.float64))
-    return " ".join(repr(float(value) + 0.0) for value in numbers)
-
-
-def _add_origin(element: ET.Element, rotation: Array, position: Array | None = None) -> None:
-    xyz = number_text(np.zeros(3) if position is None else position)
-    ET.SubElement(element, "origin", xyz=xyz, rpy=number_text(rpy_from_matrix(rotation)))
-
-
-def _add_link(robot: ET.Element, name: str, theta: Array) -> None:
-    """A link with its inertia (10,) in its URDF frame."""
-    link = ET.SubElement(robot, "link", name=name)
-    check_possible(theta, name)
-    mass, com, tensor = body_from_theta(theta)
-    inertial = ET.SubElement(link, "inertial")
-    _add_origin(inertial, np.eye(3), com)
-    ET.SubElement(inertial, "mass", value=number_text(mass))
-    six = {key: number_text(value) for key, value in six_named(tensor).items()}
-    ET.SubElement(inertial, "inertia", six)
-
-
-def _add_massless(robot: ET.Element, name: str) -> None:
-    """A link that rides on another and weighs nothing."""
-    robot.append(ET.fromstring(f"<link name={quoteattr(name)}>{NO_INERTIA}</link>"))
+    return between.join(repr(float(value) + 0.0) for value in numbers)
 
 
 def check_possible(theta: Array, name: str) -> None:
@@ -203,43 +170,8 @@ def six_named(tensor: Array) -> dict[str, float]:
     return dict(zip(SIX, six_from_tensor(tensor).tolist(), strict=True))
 
 
-def at_zero(model: SelfModel, more: Additions, k: int) -> tuple[Array, Array]:
-    """Frame of joint k (3, 3), (3,) where its sensor says zero: q = q_measured - offset."""
-    frame = model.joint_rotation()[k], model.lam[k, 3:]
-    return at_joints(*frame, -more.offset[k], model.tree.slides[k])
-
-
-def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
-    joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    return joint
-
-
-def _add_joint(
-    robot: ET.Element, model: SelfModel, k: int, turns: dict[str, Array], more: Additions
-) -> None:
-    """Joint k, its frame turned back at both ends: R_urdf = Q_i R_ij Q_jᵀ, p_urdf = Q_i p."""
-    tree, limits = model.tree, model.limits
-    i = tree.parent[k]
-    parent = tree.base_name if i == BASE else tree.link_names[i]
-    child = tree.link_names[k]
-    bounded = bool(np.isfinite(limits.lower[k]) and np.isfinite(limits.upper[k]))
-    kind = "revolute" if bounded else "continuous"
-    if tree.slides[k]:
-        kind = "prismatic"
-    joint = _joint(robot, tree.joint_names[k], kind, parent, child)
-    rotation, position = at_zero(model, more, k)
-    rotation = turns[parent] @ rotation @ turns[child].T
-    _add_origin(joint, rotation, turns[parent] @ position)
-    ET.SubElement(joint, "axis", xyz=number_text(model.axis[k]))
-    own = ((place, more.joint[place][k]) for place in more.places)
-    losses = {place: number_text(value) for place, value in own if value}
-    if losses:
-        ET.SubElement(joint, "dynamics", losses)
-    values = {key: getattr(limits, key)[k] for key in LIMITS}
-    known = {key: number_text(value) for key, value in values.items() if math.isfinite(value)}
-    if tree.slides[k]:  # of these the format demands both; 0 says nothing
-        known = dict.fromkeys(LIMITS[2:], "0") | known
-    if known:
-        ET.SubElement(joint, "limit", known)
+def principal(tensor: Array) -> tuple[Array, Array]:
+    """Principal moments (3,) of an inertia tensor and their axes, [w x y z] (4,)."""
+    moments, axes = np.linalg.eigh(tensor)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))  # right-handed
+    return moments, quaternion_from_matrix(axes)

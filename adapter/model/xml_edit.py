@@ -7,11 +7,15 @@ changes is found by its position in the text, and nothing is written from a tree
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from adapter.errors import ModelError
 
+_OURS = "adapter export: "
+_REMARK = re.compile(rb"\s*<!-- " + _OURS.encode() + rb".*?-->", re.DOTALL)
+_TAG = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""")  # up to its `>`; one in a value is none
 _ATTRIBUTE = re.compile(rb"""([^\s=/>"'<]+)\s*=\s*("[^"]*"|'[^']*')""")
 
 
@@ -67,15 +71,8 @@ class XmlText:
     def _start(self, tag: str, attributes: dict[str, str], start: int) -> None:
         parent = self._open[-1] if self._open else None
         element = Element(tag, attributes, start, parent)
-        at, quote = start, 0  # after the `>` of the start tag; one in a value is none
-        while quote or self._bytes[at] != ord(">"):
-            byte = self._bytes[at]
-            if quote:
-                quote = 0 if byte == quote else quote
-            elif byte in b"\"'":
-                quote = byte
-            at += 1
-        element.inside = at + 1
+        whole = _TAG.match(self._bytes, start)
+        element.inside = whole.end() if whole else start
         if parent is None:
             self.root = element
         else:
@@ -139,10 +136,15 @@ class XmlText:
                 new += f"{self._newline}{outer}"
         self._edits.append((at, end, new.encode()))
 
-    def remark(self, text: str) -> None:
-        """Put a comment first into the top element; XML forbids two hyphens in a row in one."""
-        comment = f"{self._newline}  <!-- {text.replace('--', '- -')} -->"
-        self._edits.append((self.root.inside, self.root.inside, comment.encode()))
+    def remark(self, lines: Sequence[str]) -> None:
+        """Put a comment first into the top element, in the place of an earlier one of ours.
+
+        Without lines there is none. XML forbids two hyphens in a row in one.
+        """
+        at, start = _REMARK.match(self._bytes, self.root.inside), self.root.inside
+        text = re.sub("-(?=-)", "- ", f"{self._newline}    ".join(lines))
+        new = f"{self._newline}  <!-- {_OURS}{text} -->".encode() if lines else b""
+        self._edits.append((start, at.end() if at else start, new))
 
     def _indent(self, element: Element) -> str | None:
         """What stands before an element in its line; None where that is more than space."""

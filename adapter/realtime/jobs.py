@@ -27,12 +27,7 @@ from adapter.realtime.ring import RawLayout, Ring
 from adapter.realtime.run_messages import RunMessages, ShownArm, estimate_names
 from adapter.realtime.shared import leave
 from adapter.realtime.showing import DisplayJob
-from adapter.realtime.snapshot import (
-    ExternalTorque,
-    Snapshot,
-    SnapshotReader,
-    SnapshotWriter,
-)
+from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader, SnapshotWriter
 from adapter.realtime.timing import LoopBoard
 from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
 from drivers.files.mcap import FLUSH_S, McapWriter

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from adapter.errors import ModelError
+from adapter.model.filled import filled
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import (
     Array,
@@ -29,7 +30,7 @@ from adapter.model.spatial import (
     z_to_axis,
 )
 from adapter.model.tree import BASE
-from adapter.model.urdf_text import URDF_PLACES, Additions, urdf_text
+from adapter.model.urdf_text import Additions
 from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import frame_observability
 from adapter.realtime.showing import View
@@ -179,7 +180,7 @@ def description_of(model: SelfModel) -> str:
     if model.source is not None and model.source.text is not None:
         return model.source.text
     try:
-        return urdf_text(model, Additions(model.tree.n, model.tree.floating, URDF_PLACES))
+        return filled("urdf", model, Additions(model.tree.n, model.tree.floating, ()))
     except ModelError:
         return ""
 

@@ -22,13 +22,7 @@ from adapter.realtime.shared import SharedMemoryError
 from adapter.realtime.showing import DisplayTask
 from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotError, SnapshotWriter
 from adapter.realtime.timing import LoopBoard
-from adapter.realtime.worker import (
-    RESTARTS,
-    RestartableWorker,
-    Worker,
-    WorkerError,
-    worker_starter,
-)
+from adapter.realtime.worker import RESTARTS, RestartableWorker, Worker, WorkerError, worker_starter
 from drivers.interface import Driver, JointSample
 
 SHORTEST_RING_S = 1.0

@@ -13,10 +13,10 @@ from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
 from adapter.gap.hand import hand_frame
+from adapter.model import robot_names
 from adapter.model.inertia import body_from_theta
 from adapter.model.locking import LOCKED
 from adapter.model.onto import SAME_PLACE
-from adapter.model.robot_names import robot_names
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, log_rotation
 from adapter.model.urdf import model_from_urdf

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,9 +14,10 @@ from numpy.typing import ArrayLike
 
 from adapter.discovery import Discovery
 from adapter.discovery import discover as discover_tree
+from adapter.effects.c_text import c_text
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.kept import keep
-from adapter.effects.robots import read_robot, robot_mjcf, robot_urdf
+from adapter.effects.robots import RobotText, read_robot, robot_mjcf, robot_text, robot_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.gap.result import GapResult
@@ -41,7 +43,14 @@ from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion
 
 HELD_OUT_SHARE = 0.25  # of a recording, at its end
-EXPORTED = (".urdf", ".xml", ".json")
+EXPORTED: dict[str, Callable[..., RobotText]] = {  # by suffix, what writes a model
+    ".urdf": robot_urdf,
+    ".xml": robot_mjcf,
+    ".c": c_text,
+    ".sdf": partial(robot_text, "sdf"),
+    ".usda": partial(robot_text, "usd"),
+    ".py": partial(robot_text, "isaac"),
+}
 
 
 def load_model(
@@ -494,7 +503,8 @@ def discover(log: Log | str | Path, *, base: str | None = None) -> Discovery:
 
 
 def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -> Path:
-    """Write a model as URDF (.urdf), MJCF (.xml), or whole as a model file of ours (.json).
+    """Write a model as URDF (.urdf), MJCF (.xml), SDF (.sdf), USD (.usda), actuators of Isaac Lab
+    (.py), C (.c), or whole as a model file of ours (.json).
 
     Args:
         model: in a URDF friction and damping stand in their place; what has none is left out.
@@ -512,12 +522,11 @@ def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -
     SelfModel(panda: 7 joints, λ documentation)
     """
     path = Path(path)
-    if path.suffix not in EXPORTED:
-        raise ModelError(f"{path}: no such format; have: {', '.join(EXPORTED)}")
     if path.suffix == ".json":
         return save_model(model, path)
-    text_of = robot_urdf if path.suffix == ".urdf" else robot_mjcf
-    path.write_bytes(text_of(model, onto).text.encode())
+    if path.suffix not in EXPORTED:
+        raise ModelError(f"{path}: no such format; have: {', '.join(EXPORTED)}, .json")
+    path.write_bytes(EXPORTED[path.suffix](model, onto).text.encode())
     return path
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adapter.effects.robots import to_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
 from adapter.simulate.effects import Effects
@@ -77,4 +77,6 @@ def plain_urdf(model: SelfModel) -> str:
     Raises:
         ModelError: a body that cannot exist.
     """
-    return to_urdf(replace(model, frames=(), limits=Limits.unknown(model.tree.n)))
+    return robot_urdf(
+        replace(model, frames=(), limits=Limits.unknown(model.tree.n)), alone=True
+    ).text

@@ -31,10 +31,10 @@ from adapter.effects.by_joint import SMOOTHING_DQ, ByJoint, JointSignals, smooth
 from adapter.effects.robots import additions
 from adapter.effects.torque import arm_between, moved_links
 from adapter.errors import ModelError, SettingsError
-from adapter.model.mjcf_text import MJCF_PLACES
+from adapter.model.filled import PLACES
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS, URDF_PLACES
+from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS
 from adapter.physics.kernels import jit
 from adapter.physics.rigid_arm import RigidArm
 
@@ -43,8 +43,8 @@ FORMATS: dict[str, tuple[str, ...]] = {
     "bodies": (),
     "bodies and armature": (ARMATURE,),
     "pybullet": (DAMPING,),
-    "urdf": URDF_PLACES,
-    "mjcf": tuple(MJCF_PLACES),
+    "urdf": PLACES["urdf"],
+    "mjcf": PLACES["mjcf"],
 }
 CROSSING_S = 0.01  # the motor crosses the gear's play in this time
 BAND_HZ = 25.0  # of what twists an elastic joint before a simulation begins

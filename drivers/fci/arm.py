@@ -17,14 +17,7 @@ from drivers.fci.safeguards import parse as parse_safeguards
 from drivers.fci.stream import STALE_NS, TICK_NS, Refusal, StateIntake, StateStream
 from drivers.fci.tables import told
 from drivers.fci.torque_control import TorqueControl
-from drivers.interface import (
-    Array,
-    DriverError,
-    Intake,
-    JointSample,
-    NotReady,
-    checked_torques,
-)
+from drivers.interface import Array, DriverError, Intake, JointSample, NotReady, checked_torques
 
 SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
 RECOVERED_S = 3.0  # from the answer to a recovery until the modes show it

@@ -22,14 +22,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from drivers.interface import (
-    Array,
-    CommandCount,
-    DriverError,
-    Intake,
-    JointSample,
-    checked_torques,
-)
+from drivers.interface import Array, CommandCount, DriverError, Intake, JointSample, checked_torques
 from drivers.process import start_module
 from drivers.ros2.bridge import BRAKES, Start
 from drivers.ros2.memory import SLOTS, Asked, Doing, Memory, Refusal

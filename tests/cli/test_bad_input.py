@@ -9,7 +9,7 @@ import pytest
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import build_parser, main
 from adapter.cli.run import run_plan
-from adapter.effects.robots import to_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -59,7 +59,7 @@ def replayed(
 
 def with_gripper(tmp_path: Path, fingers=("finger",), names: str = "panda_joint") -> Path:
     """The Panda, its joints by other names, with turning fingers behind its last link."""
-    text = to_urdf(ROBOT).replace("panda_joint", names)
+    text = robot_urdf(ROBOT, alone=True).text.replace("panda_joint", names)
     for finger in fingers:
         body = LINK.format(finger, 0.5, INERTIA)
         joint = (

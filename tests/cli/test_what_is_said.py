@@ -92,12 +92,12 @@ def test_theta_that_has_not_converged_says_so_wherever_it_goes(tmp_path: Path, c
         line = ["export", str(path), "--urdf", str(files[0]), "--mjcf", str(files[1]), *more]
         assert main(line) == 0 and why in capsys.readouterr().err
         for file in (out / "model.urdf", *files):
-            assert f"<!-- θ: {why}" in file.read_text()
+            assert f"    θ: {why}" in file.read_text()
             assert read_robot(file).tree.n == 7
     assert main(replay) == 0 and why not in capsys.readouterr().err
     model = load_model(path)
     assert model.provenance["theta_converged"] and "theta_note" not in model.provenance
-    assert "<!-- θ" not in (out / "model.urdf").read_text()
+    assert "θ:" not in (out / "model.urdf").read_text()
 
 
 def test_exit_codes_stand_in_the_pages_and_in_the_help() -> None:

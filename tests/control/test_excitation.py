@@ -19,7 +19,7 @@ from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.push_bound import PushBound, left_at_most, push_bound
 from adapter.control.settings import ExcitationSettings, SafetySettings
-from adapter.effects.robots import to_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.errors import SettingsError
 from adapter.model.robots import documented
 from sim.plant import SimulatedArm
@@ -179,7 +179,7 @@ def test_forces_at_the_hand_that_a_motion_is_ended_by() -> None:
     bound = push_bound(PANDA, motion, LIMITS, safety)
     np.testing.assert_allclose(bound.joints, safety.external_share * LIMITS.effort)
 
-    oracle, rng, stops = pin_model(to_urdf(PANDA)), np.random.default_rng(5), []
+    oracle, rng, stops = pin_model(robot_urdf(PANDA, alone=True).text), np.random.default_rng(5), []
     data = oracle.createData()
     for s in rng.uniform(0.0, 30.0, 300):
         q = motion.path(float(s))[0]

@@ -13,15 +13,7 @@ from adapter.discovery.hypotheses import FREE, Option
 from adapter.discovery.tree_search import TreeSearch, cycle
 from adapter.errors import ModelError, SettingsError
 from adapter.model.spatial import log_rotation, matrix_from_zxz
-from tests.helpers.discovery_data import (
-    RATE_HZ,
-    SHORT,
-    TRUSTED,
-    Case,
-    Motion,
-    confidences,
-    record,
-)
+from tests.helpers.discovery_data import RATE_HZ, SHORT, TRUSTED, Case, Motion, confidences, record
 
 NO_TURNING = (1, 1, 1, 0, 0, 0)
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from adapter.effects.robots import read_robot, to_urdf
+from adapter.effects.robots import read_robot, robot_urdf
 from adapter.signals.lerobot import write_lerobot
 from tests.helpers.pages import PATIENCE_S, blocks, commands, give
 from tests.helpers.position_arm import Drawn, position_arm
@@ -32,7 +32,7 @@ def test_from_a_data_set_to_a_simulated_arm(
     place = more.column_names.index("episode_index")
     more = more.set_column(place, "episode_index", pa.array(np.ones(len(more), dtype=np.int64)))
     pq.write_table(more, tmp_path / "so101_set" / "data" / "chunk-000" / "file-001.parquet")
-    (tmp_path / "so101.urdf").write_text(to_urdf(read_robot("panda")))
+    (tmp_path / "so101.urdf").write_text(robot_urdf(read_robot("panda"), alone=True).text)
     lines = [line for block in blocks("sh", PAGE) for line in commands(block)]
     assert len(lines) == 6
     for line in lines:

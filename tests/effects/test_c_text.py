@@ -130,6 +130,7 @@ def test_what_c_cannot_hold_is_said() -> None:
     names = {x["effect"] for x in NAMED} - held - ended | {"law: curve(q)"}
     assert set(written.left_out) == names
     head = written.text.partition("*/")[0]
-    assert all(name in head for name in names) and "viscous_friction" in head
+    assert all(f"{KNOWN[x].title}: no\n" in head for x in names)
+    assert "viscous friction: whole\n" in head
     with pytest.raises(ModelError, match="its base floats"):
         c_text(documented("panda").with_base(True))

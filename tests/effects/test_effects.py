@@ -388,10 +388,7 @@ POSSIBLE = {
     "viscous_friction": ({"Fv": 0.1}, {"Fv": -0.1}),
     "coulomb_friction": ({"Fc": 0.1}, {"Fc": -0.1}),
     "asymmetric_friction": ({"Fc_pos": 0.1, "Fc_neg": 0.4}, {"Fc_pos": 0.1, "Fc_neg": -0.4}),
-    "stribeck_friction": (
-        {"Fc": 0.1, "Fs": 0.4, "vs": 0.1},
-        {"Fc": 0.4, "Fs": 0.1, "vs": 0.1},
-    ),
+    "stribeck_friction": ({"Fc": 0.1, "Fs": 0.4, "vs": 0.1}, {"Fc": 0.4, "Fs": 0.1, "vs": 0.1}),
     "bristle_friction": ({"Fc": 0.1, "s0": 1e-3}, {"Fc": -0.1, "s0": 1e-3}),
     "torque_filter": ({"d": -0.001, "c": 1e-5}, {"d": 0.002, "c": -1e-5}),
     "load_dependent_friction": ({"Fl": 0.1}, {"Fl": -0.1}),

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from adapter.effects.active import with_bodies
-from adapter.effects.robots import robot_mjcf, robot_urdf, to_urdf
+from adapter.effects.robots import robot_mjcf, robot_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -30,11 +30,7 @@ BODIES = (
 LOSSES = (
     {"effect": "viscous_friction", "joints": [1, 2], "parameters": {"Fv": [0.1, 0.2]}},
     {"effect": "coulomb_friction", "joints": [1], "parameters": {"Fc": 0.3}},
-    {
-        "effect": "stribeck_friction",
-        "joints": [2],
-        "parameters": {"Fc": 0.4, "Fs": 0.7, "vs": 0.1},
-    },
+    {"effect": "stribeck_friction", "joints": [2], "parameters": {"Fc": 0.4, "Fs": 0.7, "vs": 0.1}},
     {"effect": "asymmetric_friction", "joints": [3], "parameters": {"Fc_pos": 0.6, "Fc_neg": 0.2}},
 )
 
@@ -55,7 +51,10 @@ def apart(one: SelfModel, other: SelfModel) -> float:
 
 def test_pinocchio_reads_the_same_arm() -> None:
     model = carrying(*BODIES)
-    oracle, back = pin_model(to_urdf(model)), read_quietly(to_urdf(model), False)
+    oracle, back = (
+        pin_model(robot_urdf(model, alone=True).text),
+        read_quietly(robot_urdf(model, alone=True).text, False),
+    )
     assert {frame.name for frame in model.frames} < {frame.name for frame in back.frames}
     data = oracle.createData()
     for q, dq, ddq in zip(*signals(7), strict=True):
@@ -65,7 +64,7 @@ def test_pinocchio_reads_the_same_arm() -> None:
 
 
 def test_a_tilted_base_stands_on_an_upright_link() -> None:
-    text = to_urdf(carrying(BODIES[2]))
+    text = robot_urdf(carrying(BODIES[2]), alone=True).text
     joint = ET.fromstring(text).find("joint[@name='panda_link0_upright_joint']")
     assert joint is not None and joint.get("type") == "fixed"
     parent, child, origin = (joint.find(tag) for tag in ("parent", "child", "origin"))
@@ -83,13 +82,13 @@ def test_a_base_that_was_tilted_twice_stands_as_it_stands_in_the_model() -> None
         for x, y in ((0.3, 0.0), (0.0, 0.4))
     ]
     model = carrying(*tilts)
-    assert apart(read_quietly(to_urdf(model), False), model) < 1e-9
+    assert apart(read_quietly(robot_urdf(model, alone=True).text, False), model) < 1e-9
     assert apart(carrying(*tilts[::-1]), model) > 1e-3
 
 
 def test_friction_is_in_dynamics_and_nowhere_else_mentioned() -> None:
     twice = {"effect": "viscous_friction", "joints": [2], "parameters": {"Fv": 0.05}}
-    robot = ET.fromstring(to_urdf(carrying(*LOSSES, twice)))
+    robot = ET.fromstring(robot_urdf(carrying(*LOSSES, twice), alone=True).text)
     found = {
         joint.get("name"): {key: float(x) for key, x in dynamics.attrib.items()}
         for joint in robot.iter("joint")
@@ -147,37 +146,36 @@ def test_what_has_no_place_is_in_one_comment() -> None:
             "parameters": {"o": 1.0},
         },
     )
-    (said,) = comments(to_urdf(carrying(*LOSSES, *left)))
+    (said,) = comments(robot_urdf(carrying(*LOSSES, *left), alone=True).text)
     for part in (
-        "motor_inertia of panda_joint5, B = 0.15 kg m2",
-        "signal_delay, d = 0.002 s",
-        "bristle_friction of panda_joint3, Fc = 0.4 N m, s0 = 0.001 rad (Fc is there",
-        "torque_filter of panda_joint3, d = 0.004 s, c = 1e-05 s2",
-        "stribeck_friction of panda_joint2",
+        "reflected motor inertia: no\n      panda_joint5: B = 0.15 kg m2",
+        "signal delay: no\n      d = 0.002 s",
+        "Fc is there as the joint's friction\n      panda_joint3: Fc = 0.4 N m, s0 = 0.001 rad",
+        "panda_joint3: d = 0.004 s, c = 1e-05 s2",
+        "viscous friction: whole\n    Coulomb friction: whole\n    Stribeck friction: Fc",
         "Fs = 0.7 N m",
         "Fc_pos = 0.6 N m",
         "damping of panda_joint6, which is negative: -0.01",
-        "torque_offset of panda_joint1, o = 1 N m (it ended)",
+        "panda_joint1: o = 1 N m (it ended)",
     ):
         assert part in said
-    assert "coulomb_friction" not in said
     names = ["asymmetric_friction", "bristle_friction", "motor_inertia"]
     names += ["signal_delay", "stribeck_friction", "torque_filter"]
     assert robot_urdf(carrying(*LOSSES, *left)).left_out == tuple(sorted([*names, "torque_offset"]))
-    assert comments(to_urdf(carrying(*BODIES, *LOSSES[:2]))) == []
-    assert comments(to_urdf(documented("panda"))) == []
+    assert comments(robot_urdf(carrying(*BODIES, *LOSSES[:2]), alone=True).text) == []
+    assert comments(robot_urdf(documented("panda"), alone=True).text) == []
 
 
 def test_a_load_without_inertia_is_part_of_the_link() -> None:
     model = carrying({"effect": "payload", "parameters": LOAD})
-    text = to_urdf(model)
+    text = robot_urdf(model, alone=True).text
     (said,) = comments(text)
-    assert "payload, m = 1.3 kg" in said and "the last link has it" in said
+    assert "the last link has it\n      m = 1.3 kg" in said
     assert apart(read_quietly(text, False), model) < 1e-9
 
 
 def test_gravity_that_is_not_upright_is_said() -> None:
-    (said,) = comments(to_urdf(documented("panda", gravity=[9.81, 0.0, 0.0])))
+    (said,) = comments(robot_urdf(documented("panda", gravity=[9.81, 0.0, 0.0]), alone=True).text)
     assert "gravity [9.81, 0.0, 0.0] m/s2" in said
 
 

@@ -27,7 +27,7 @@ from adapter.effects.catalogue import CATALOGUE, registered
 from adapter.effects.kept import keep, read_kept, with_kept
 from adapter.effects.law import CURVES, LAWS, Curve, Law, splines
 from adapter.effects.phrases import SPEEDS, Phrase, experiments
-from adapter.effects.robots import robot_urdf, to_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.errors import ModelError, SettingsError
 from adapter.gap.result import GapResult
 from adapter.gap.words import as_json, headline
@@ -344,7 +344,7 @@ def test_it_is_simulated(simulator: str) -> None:
 
 
 def test_it_is_exported() -> None:
-    text = to_urdf(with_drag())
+    text = robot_urdf(with_drag(), alone=True).text
     assert f'<dynamics damping="{C}" />' in text and text.count("<dynamics") == 1
-    assert "drag of panda_joint2" in text and "its slope at 0.5 rad/s is damping" in text
+    assert "its slope at 0.5 rad/s is damping\n      panda_joint2: " in text
     assert robot_urdf(with_drag()).left_out == ("drag",)

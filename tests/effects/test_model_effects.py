@@ -173,10 +173,7 @@ def test_theta_is_the_arms_where_the_model_knows_of_sensors_and_gears() -> None:
 
 def wrong_friction(fc: float, std: float | None) -> SelfModel:
     joints = range(1, N + 1)
-    levels = {
-        **entry("coulomb_friction", joints, Fc=[fc] * N),
-        "std": {"Fc": [std] * N},
-    }
+    levels = {**entry("coulomb_friction", joints, Fc=[fc] * N), "std": {"Fc": [std] * N}}
     viscous = {**entry("viscous_friction", joints, Fv=[0.05] * N), "std": {"Fv": [0.02] * N}}
     return with_effects(levels, viscous)
 

@@ -185,12 +185,7 @@ def test_repeats_are_told_from_other_motions():
 # ---------------------------------------------------------------- noise
 
 ROWS = 480  # 19 s at 25 Hz
-PROCESSES = {
-    "white": [],
-    "first order": [0.8],
-    "resonant": [1.5, -0.9],
-    "rough": [-0.5],
-}
+PROCESSES = {"white": [], "first order": [0.8], "resonant": [1.5, -0.9], "rough": [-0.5]}
 
 
 def process(name: str, seed: int, columns: int = N, rows: int = ROWS) -> Array:

@@ -22,14 +22,7 @@ from adapter.model.urdf import model_from_urdf
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import Commands, Log, read_position_log, write_log
-from tests.helpers.position_arm import (
-    Drawn,
-    PositionArm,
-    as_log,
-    errors,
-    named,
-    position_arm,
-)
+from tests.helpers.position_arm import Drawn, PositionArm, as_log, errors, named, position_arm
 from tests.helpers.robot_models import machine_urdf
 
 PANDA = read_robot("panda")

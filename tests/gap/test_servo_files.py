@@ -24,6 +24,7 @@ from adapter.model.self_model import Limits
 from adapter.physics.rigid_arm import RigidArm
 from tests.helpers.position_arm import Drawn, as_log, position_arm
 from tests.helpers.position_mujoco import error_in_mujoco
+from tests.helpers.robot_models import file_of
 
 PANDA = read_robot("panda")
 FREE = replace(PANDA, limits=Limits.unknown(7))  # the simulated motors have no ends
@@ -63,47 +64,8 @@ def test_mujoco_alone_moves_as_our_simulation(
         assert air.tracking_error(track, RigidArm.of(PANDA)).max() > 5.0 * own.max()
 
 
-DRESSED = """<mujoco model="dressed">
-  <default><position dampratio="1" kp="5"/><default class="small"><joint damping="3"/></default>
-  </default>
-  <compiler angle="radian"/><option timestep="0.002"/>
-  <worldbody><!-- a table -->
-    <geom name="ground" type="plane" size="1 1 1"/>
-    <body name="low" pos="0 0 1"><inertial pos="0 0 .1" mass="1" diaginertia="1e-2 1e-2 1e-2"/>
-      <joint name="a" class="small" axis="0 1 0" range="-2 2"/>
-      <body name="high" pos="0 0 .3"><inertial pos="0 0 .1" mass="1" diaginertia="1e-2 1e-2 1e-2"/>
-        <joint name="b" axis="1 0 0" pos="0 0 .01" range="-1 1"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="lifts" joint="b" ctrlrange="-9 9" forcerange="-4 4"/>
-    <position joint="a" kp="900"/>
-    <velocity name="brakes" joint="a" kv="2"/>
-  </actuator>
-  <keyframe><key name="home" qpos="0 0" ctrl="0.5 0.25 0"/></keyframe>
-</mujoco>
-"""
-SERVO = """delay_s = 0.004
-[[joint]]
-name = "a"
-position_gain = 20.0
-velocity_gain = 0.7
-viscous = 0.2
-feeds_speed = true
-[[joint]]
-name = "b"
-position_gain = 30.0
-velocity_gain = 0.9
-coulomb = 0.1
-armature = 0.02
-[ground]
-joint = "b"
-point = [0.0, 0.0, 0.2]
-up = [0.0, 0.0, 1.0]
-height = -0.5
-stiffness = 300.0
-"""
+DRESSED = file_of("servo_arm.xml")
+SERVO = file_of("servo.toml")
 
 
 @pytest.fixture

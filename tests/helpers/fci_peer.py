@@ -19,10 +19,7 @@ HEADER = struct.Struct("<III")
 STATE_SIZE = {5: 2373, 10: 1377}
 COMMAND_SIZE = {5: 370, 10: 371}
 # version: (number format, its size, tau_J, tau_J_d, q, dq, generator mode, success rate)
-PLACES = {
-    5: ("d", 1016, 1072, 1184, 1296, 2280, 2365),
-    10: ("f", 512, 540, 596, 652, 1288, 1373),
-}
+PLACES = {5: ("d", 1016, 1072, 1184, 1296, 2280, 2365), 10: ("f", 512, 540, 596, 652, 1288, 1373)}
 SET_COLLISION, SET_LOAD = {5: 4, 10: 3}, {5: 10, 10: 9}
 LOAD_AT = {5: 880, 10: 444}
 MOVE, STOP_MOVE, RECOVER = 1, 2, {5: 12, 10: 10}

@@ -61,6 +61,11 @@ def real_log() -> Log:
     return Log(Path("real.mcap"), joints, stamps, *(x.reshape(-1, 7) for x in signals))
 
 
+def file_of(name: str) -> str:
+    """Text of a file of `tests/helpers/files`."""
+    return (Path(__file__).parent / "files" / name).read_text(encoding="utf-8")
+
+
 def urdf_text(name: str) -> str:
     """The URDF of a robot of `ROBOTS`."""
     if name in MACHINES:

@@ -28,7 +28,7 @@ LOOSE = {"__init__.py", "__main__.py", "errors.py", "optional.py", "shadowed.py"
 HEAVY = {
     *("torch", "numba", "pybullet", "matplotlib", "scipy", "filterpy", "clarabel", "sklearn"),
     *("pinocchio", "coal", "mujoco", "can", "differentiable_robot_model", "figaroh"),
-    *("rich", "importlib.metadata", "foxglove", "cyclonedds"),
+    *("rich", "importlib.metadata", "foxglove", "cyclonedds", "jinja2"),
 }
 FACES = {
     "adapter",

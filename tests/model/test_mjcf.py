@@ -14,45 +14,16 @@ import pytest
 
 from adapter.effects.robots import read_robot, robot_mjcf
 from adapter.effects.torque import ModelTorque
-from adapter.errors import ModelError, ModelWarning
+from adapter.errors import MeansError, ModelError, ModelWarning
 from adapter.model.model_file import load_model, save_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
+from tests.helpers.robot_models import file_of
 from tests.model.test_onto import learned
 
 # Degrees, defaults, joints beside their body's origin, a zero elsewhere, bodies whose mass comes
 # from their shape, a finger on a tendon, and things that lie about.
-ARM = """<mujoco model="bench arm">
-  <!-- kept -->
-  <compiler angle="degree"/>
-  <include file="defaults.xml"/>
-  <option gravity="0 0 -9.8"/>
-  <worldbody>
-    <light pos="0 0 2"/>
-    <body name="stand" pos="0 0 1" euler="20 0 0">
-      <geom type="box" size="0.1 0.1 0.1"/>
-      <body name="upper" pos="0 0.1 0.2" euler="10 20 30" childclass="arm">
-        <inertial pos="0.01 0 0.1" mass="2" fullinertia="0.02 0.018 0.01 0.001 0 0.002"/>
-        <joint name="shoulder" axis="0 1 0" pos="0.02 0 -0.05" ref="15" range="-90 120"/>
-        <geom type="capsule" size="0.03 0.1" rgba="1 0 0 1"/>
-        <body name="bracket" pos="0.1 0 0"><geom type="sphere" size="0.03"/>
-          <body name="lower" pos="0 0 0.3">
-            <joint name="elbow" axis="0.6 0 0.8" armature="0.3" stiffness="2" springref="30"/>
-            <geom type="capsule" size="0.03 0.1" pos="0 0 0.1"/>
-            <body name="finger" pos="0 0 0.2">
-              <joint name="grip" type="slide" axis="1 0 0" ref="0.01" range="0 0.02"/>
-              <geom type="sphere" size="0.02"/>
-            </body>
-          </body>
-        </body>
-      </body>
-    </body>
-    <body name="cube" pos="1 0 0"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
-  </worldbody>
-  <tendon><fixed name="cord"><joint joint="grip" coef="1"/></fixed></tendon>
-  <actuator><motor joint="elbow" forcerange="-30 30" gear="2"/></actuator>
-</mujoco>
-"""
+ARM = file_of("bench_arm.xml")
 DEFAULTS = """<mujocoinclude><default><default class="arm">
 <joint damping="0.4" frictionloss="0.2"/></default></default></mujocoinclude>"""
 
@@ -231,5 +202,5 @@ def test_a_floating_robot_is_the_free_body_that_carries_joints(arm: Path) -> Non
 
 def test_without_mujoco_the_extra_is_named(arm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ModelError, match=r"panda-adapter\[mujoco\]"):
+    with pytest.raises(MeansError, match=r"panda-adapter\[mujoco\]"):
         read_robot(arm)

@@ -150,16 +150,12 @@ READERS: dict[str, tuple[Callable[..., Answer], ...]] = {
 }
 
 
-def as_learned(text: str) -> SelfModel:
-    """A learned arm with a tool, as a run leaves it."""
-    tool = Tool(0.6, np.array([0.01, 0.02, 0.05]), np.diag([1e-3, 2e-3, 2.5e-3]))
-    return replace(learned(read_quietly(text), seed=5), tool=tool)
-
-
 @pytest.mark.parametrize("form", ["onto its URDF", "URDF alone", "MJCF alone"])
 @pytest.mark.parametrize("arm", ARMS)
 def test_three_engines_read_the_same_arm(arm: str, form: str, tmp_path: Path) -> None:
-    model = as_learned(ARMS[arm])
+    """Of a learned arm with a tool, as a run leaves it."""
+    tool = Tool(0.6, np.array([0.01, 0.02, 0.05]), np.diag([1e-3, 2e-3, 2.5e-3]))
+    model = replace(learned(read_quietly(ARMS[arm]), seed=5), tool=tool)
     path = tmp_path / ("arm.xml" if "MJCF" in form else "arm.urdf")
     alone = "alone" in form
     written = robot_mjcf(model, alone=True) if "MJCF" in form else robot_urdf(model, alone=alone)

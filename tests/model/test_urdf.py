@@ -6,13 +6,14 @@ import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.effects.robots import robot_urdf, to_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented, names
@@ -37,7 +38,7 @@ from tests.helpers.robot_models import (
 def test_round_trip_keeps_pinocchios_torques_and_frames(robot: str, floating: bool) -> None:
     text = urdf_text(robot)
     model = read_quietly(text, floating)
-    written = to_urdf(model)
+    written = robot_urdf(model, alone=True).text
     again = read_quietly(written, floating)
     np.testing.assert_allclose(again.theta, model.theta, atol=1e-12)
     np.testing.assert_allclose(again.axis, model.axis, atol=1e-15)
@@ -126,11 +127,11 @@ def test_a_tool_is_kept_apart_and_counts_in_the_torques() -> None:
     model = replace(documented("panda"), tool=tool)
     assert model.theta_with_tool()[6, 0] == pytest.approx(model.theta[6, 0] + 0.8)
     np.testing.assert_array_equal(model.theta_with_tool()[:6], model.theta[:6])
-    merged = model_from_urdf(to_urdf(model))
+    merged = model_from_urdf(robot_urdf(model, alone=True).text)
     np.testing.assert_allclose(merged.theta, model.theta_with_tool(), atol=1e-12)
 
 
-@pytest.mark.parametrize("write", [to_urdf, robot_urdf])
+@pytest.mark.parametrize("write", [partial(robot_urdf, alone=True), robot_urdf])
 def test_an_impossible_body_is_not_exported(write: Callable[[SelfModel], object]) -> None:
     model = documented("panda")
     theta = model.theta.copy()

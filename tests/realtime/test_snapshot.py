@@ -29,8 +29,7 @@ from tests.helpers.live_learners import nothing_known
 
 moves = st.lists(
     st.one_of(
-        st.tuples(st.just("push"), st.integers(1, 9)),
-        st.tuples(st.just("take"), st.integers(0, 9)),
+        st.tuples(st.just("push"), st.integers(1, 9)), st.tuples(st.just("take"), st.integers(0, 9))
     ),
     max_size=60,
 )

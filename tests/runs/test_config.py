@@ -12,41 +12,9 @@ from hypothesis import strategies as st
 from adapter.errors import ModelError, SettingsError
 from adapter.model.robots import documented
 from adapter.runs.config import Config, config_from, config_recorded, config_table, read_config
+from tests.helpers.robot_models import file_of
 
-WHOLE = """
-gravity = [9.81, 0, 0.0]
-
-[tool]
-mass = 1
-com = [0.0, 0.0, 0.1]
-inertia = [0.01, 0, 0, 0.01, 0, 0.005]
-
-[pipeline.filter]
-bandwidth_hz = 8
-
-[pipeline.front_end]
-rest_dq = 0.03
-
-[pipeline.learner]
-mode = "sample"
-effects = ["viscous_friction", "coulomb_friction"]
-seed = 4
-wait_for_schema = false
-
-[pipeline.learner.schema]
-forget_s = 3.0
-
-[pipeline.learner.theta]
-betas = [0.9, 0.95]
-restarts = [10, 20]
-
-[pipeline.learner.change]
-enabled = false
-
-[excitation]
-seed = 9
-rests = [[5.0, 8.0], [12, 15]]
-"""
+WHOLE = file_of("config.toml")
 
 
 def written(folder: Path, text: str) -> Path:

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.effects.robots import to_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.learning.learner import OnlineLearner
 from adapter.model.model_file import dumps, loads
 from adapter.model.spatial import matrix_from_zxz, rot_z, zxz_from_matrix
@@ -48,7 +48,7 @@ def test_the_exported_arm_stands_where_the_documented_one_does() -> None:
     documented = panda_model()
     model = learned_model(collect(taught("synthesized", 0)), documented)
     for q in random_motion(documented.tree, 5, 1).q:
-        ours, theirs = (places(to_urdf(x), q) for x in (model, documented))
+        ours, theirs = (places(robot_urdf(x, alone=True).text, q) for x in (model, documented))
         assert np.abs(ours - theirs).max() < 1e-6
     filled = loads(dumps(model)).provenance["lambda_filled"]
     assert [text.split(":")[0] for text in filled] == ["panda_joint1", "panda_joint2"]

@@ -8,16 +8,7 @@ from scipy.integrate import solve_ivp
 
 from sim.engine import Engine
 from sim.scenarios import build
-from tests.helpers.board_tools import (
-    IDS,
-    MS_NS,
-    NOTHING,
-    PANDA,
-    frame,
-    mit,
-    parse,
-    rig,
-)
+from tests.helpers.board_tools import IDS, MS_NS, NOTHING, PANDA, frame, mit, parse, rig
 from tests.helpers.can_line import frame_ns
 
 READY = build("nominal").truth.ready

@@ -139,12 +139,7 @@ def test_data_depends_on_the_seed_and_on_nothing_else(tmp_path: Path) -> None:
 
 def test_whatever_decides_the_content_decides_the_name(tmp_path: Path) -> None:
     heavier = replace(TREE, theta=TREE.theta * 1.001)
-    changes = [
-        {},
-        {"robot": heavier},
-        {"flight": Flight(0.05)},
-        {"flight": Flight(0.04, seed=7)},
-    ]
+    changes = [{}, {"robot": heavier}, {"flight": Flight(0.05)}, {"flight": Flight(0.04, seed=7)}]
     common = {"robot": TREE, "flight": Flight(0.04), "trajectories": 1, "folder": tmp_path}
     names = {data_set(**common | change).jobs[0].path for change in changes}
     assert len(names) == len(changes) == len(list(tmp_path.iterdir()))

@@ -105,8 +105,7 @@ FOR_A_TIME = [*(e for e in ON_JOINTS if e.name in PASSING), *BODIES, WRENCH]
 
 
 @pytest.mark.parametrize(
-    "effect",
-    [*ON_JOINTS, *BODIES, *(replace(e, interval_s=(0.4, 0.8)) for e in FOR_A_TIME)],
+    "effect", [*ON_JOINTS, *BODIES, *(replace(e, interval_s=(0.4, 0.8)) for e in FOR_A_TIME)]
 )
 def test_torque_of_an_effect_is_that_of_the_table(effect):
     record = Record(arm_with(effect))

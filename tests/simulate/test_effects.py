@@ -13,9 +13,9 @@ import pinocchio as pin
 import pybullet
 import pytest
 
-from adapter.effects.robots import additions, robot_mjcf, to_urdf
+from adapter.effects.robots import additions, robot_mjcf, robot_urdf
 from adapter.errors import MeansError, ModelError, SettingsError
-from adapter.model.mjcf_text import MJCF_PLACES, joint_attributes
+from adapter.model.filled import MJCF_PLACES, joint_attributes
 from adapter.model.self_model import SelfModel
 from adapter.simulate import FORMATS, SIMULATORS, Effects, MujocoArm, Rollouts
 from sim.effects import Effect
@@ -190,7 +190,7 @@ def test_sensors_read_what_the_effects_say() -> None:
 def test_plain_mj_steps_have_the_effects() -> None:
     """A file with losses of its own, stepped by anybody, moves as our loop moves the bare arm."""
     model = model_with(*LOSSES)
-    theirs = mujoco.MjModel.from_xml_string(to_urdf(replace(model, frames=())))
+    theirs = mujoco.MjModel.from_xml_string(robot_urdf(replace(model, frames=()), alone=True).text)
     theirs.opt.timestep = 1e-3
     data = mujoco.MjData(theirs)
     wrapped, own = MujocoArm(model, (theirs, data)), MujocoArm(model)
@@ -239,7 +239,7 @@ def _own_mujoco(model: SelfModel, tau: np.ndarray, folder: Path, share: float) -
 
 def _own_pybullet(model: SelfModel, tau: np.ndarray, folder: Path, share: float) -> np.ndarray:
     path, effects, joints = folder / "arm.urdf", Effects(model, holds="pybullet"), list(range(7))
-    path.write_text(to_urdf(replace(model, frames=())))
+    path.write_text(robot_urdf(replace(model, frames=()), alone=True).text)
     client = {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE
     arm = pybullet.loadURDF(str(path), useFixedBase=True, flags=flags, **client)

@@ -72,9 +72,7 @@ def _sentence(piece: str) -> str:
     said = re.sub(r"\b\d{5,}\b", lambda x: grouped(int(x[0])), said)
     said = re.sub(r"(\d)%", rf"\1{NARROW}%", said)
     said = re.sub(  # a number with an exponent, with as many digits
-        r"\b\d+(?:\.(\d+))?e[+-]\d+\b",
-        lambda x: scientific(float(x[0]), 1 + len(x[1] or "")),
-        said,
+        r"\b\d+(?:\.(\d+))?e[+-]\d+\b", lambda x: scientific(float(x[0]), 1 + len(x[1] or "")), said
     )
     said = re.sub(r"(?<![\w.])-(?=\d)", "−", said)
     first = said[:1]

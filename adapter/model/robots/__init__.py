@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError
+from adapter.model import FOLDER, ROBOT_FILES
+from adapter.model import robot_names as names
 from adapter.model.locking import restricted
 from adapter.model.model_file import load_model
-from adapter.model.robot_names import FOLDER, ROBOT_FILES
-from adapter.model.robot_names import robot_names as names
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz, vector3
 from adapter.model.urdf import read_urdf
