@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from adapter.judgement.noise import LEAST_NM, USUAL_S, memory_s
+from adapter.judgement.noise import LEAST_NM, MEMORY_S, memory_s
 from adapter.model.spatial import Array
 
 
@@ -166,7 +166,7 @@ def noise_of(residual: Array, weight: Array | None = None) -> Noise:
     left = residual * weight
     rows = np.maximum(np.sum(weight**2, axis=0), 1.0)
     level = np.sqrt(np.sum(left**2, axis=0) / rows + LEAST_NM**2)
-    return Noise(level, BAND_HZ * memory_s(left, 1.0 / BAND_HZ, rows))
+    return Noise(level, BAND_HZ * memory_s(left, 1.0 / BAND_HZ))
 
 
 def quiet_noise(residual: Array, weight: Array) -> Noise:
@@ -184,4 +184,4 @@ def quiet_noise(residual: Array, weight: Array) -> Noise:
     spread = np.sum(rows * (left - mean[:, None]) ** 2, axis=1) / count
     middle = np.quantile(spread, 0.5, axis=0, weights=count, method="inverted_cdf")
     level = np.sqrt(middle + LEAST_NM**2)
-    return Noise(level, np.full(len(level), BAND_HZ * USUAL_S))
+    return Noise(level, np.full(len(level), BAND_HZ * MEMORY_S[0]))

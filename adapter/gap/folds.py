@@ -5,8 +5,7 @@ A block is held out as a whole, since neighbouring instants know each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -49,56 +48,32 @@ def fold_rows(fit: Fit) -> np.ndarray:
     return np.concatenate(rows)
 
 
-@dataclass(frozen=True, eq=False)
-class Folds:
-    """Products of what a fit carries, in each fold apart.
+def without_each(fit: Fit, carried: Carried | Moments) -> list[Normal]:
+    """What is known of a fit's coefficients without the blocks of each fold in turn.
 
-    Attributes:
-        G: (FOLDS, c, c) of the signatures with one another; g: (FOLDS, c) with the data.
-        prior_std: (c,) of the coefficients.
+    Names, dates and the noise are those that all data gave; what is fitted is refitted.
     """
-
-    G: Array
-    g: Array
-    prior_std: Array
-
-    @classmethod
-    def of(cls, fit: Fit, carried: Carried | Moments) -> Folds:
-        """What is known of a fit's coefficients, by folds."""
-        if isinstance(carried, Moments):
-            return cls(*carried.folds, carried.prior_std)
-        fold = fold_rows(fit)
-        parts = [(carried.N[:, fold == f], carried.data[fold == f]) for f in range(FOLDS)]
-        return cls(
-            np.array([N @ N.T for N, _ in parts]),
-            np.array([N @ data for N, data in parts]),
-            carried.prior_std,
-        )
-
-    @cached_property
-    def every(self) -> Normal:
-        """Coefficients by all folds."""
-        return Normal(self.G.sum(0), self.g.sum(0), self.prior_std)
-
-    @cached_property
-    def known(self) -> list[Normal]:
-        """Coefficients once per fold, each without that fold's blocks of time.
-
-        Names, dates and the noise are those that all data gave; what is fitted is refitted.
-        """
-        G, g = self.every.G - self.G, self.every.g - self.g
-        return [Normal(*both, self.prior_std) for both in zip(G, g, strict=True)]
+    if isinstance(carried, Moments):
+        products = list(zip(*carried.folds, strict=True))
+    else:
+        rows = [fold_rows(fit) == f for f in range(FOLDS)]
+        parts = [(carried.N[:, on], carried.data[on]) for on in rows]
+        products = [(N @ N.T, N @ data) for N, data in parts]
+    return [Normal(carried.G - G, carried.g - g, carried.prior_std) for G, g in products]
 
 
-def pays_held_out(fit: Fit, folds: Folds, k: int) -> bool:
+def pays_held_out(fit: Fit, every: Normal, others: Sequence[Normal], k: int) -> bool:
     """Whether the k-th named effect foretells unseen blocks, fold by fold.
 
     By likelihood: a fold's, given the others, is that of all over theirs. What they leave open is
     doubt then, and no error; it is much where a joint moves in one fold alone. All folds together
     foretell as much as the effect is worth where it is the same in each.
+
+    Args:
+        every: what is known of the fit's coefficients; others: see `without_each`.
     """
     own, rest = beside(fit, k)
     if fit.named[k].candidate.effect is LATENESS:  # the carried error would stand for it
         rest = rest[rest != fit.dtheta.size]
-    every, *others = (x.worth(own, rest).log_evidence for x in (folds.every, *folds.known))
-    return FOLDS * every - sum(others) > FORETOLD * every
+    value, *parts = (x.worth(own, rest).log_evidence for x in (every, *others))
+    return FOLDS * value - sum(parts) > FORETOLD * value

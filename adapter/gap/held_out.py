@@ -22,7 +22,7 @@ from adapter.errors import ModelError
 from adapter.gap.evidence import Carried, Moments, Normal
 from adapter.gap.findings import entries, noise_floor, posterior_of
 from adapter.gap.fit import BLOCK, Fit, Model, place_of, refitted
-from adapter.gap.folds import FOLD_S, FOLDS, Folds, block_s, fold_of, holds_out
+from adapter.gap.folds import FOLD_S, FOLDS, block_s, fold_of, holds_out, without_each
 from adapter.gap.long_recording import LongRecording
 from adapter.gap.real_arm import SPRING
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
@@ -56,7 +56,7 @@ def held_out_models(
 ) -> list[list[SelfModel]]:
     """Of each recording one model per fold: refitted without that fold's blocks of time."""
     models: list[list[SelfModel]] = [[] for _ in fit.recordings]
-    for known in Folds.of(fit, carried).known:
+    for known in without_each(fit, carried):
         try:
             own = [model_of(model, possible(fit.at(known.x), known), i) for i in range(len(models))]
         except ModelError:  # a coefficient at its bound without these data
@@ -433,7 +433,7 @@ def _curves(name: str, found: Found, i: int) -> Curves:
     own, model = found.fit.recordings[i], found.fit.model
     nominal = Model((own,), np.zeros_like(found.fit.dtheta), known=model.known)
     after = np.empty_like(own.tau)
-    for f, known in enumerate(Folds.of(found.fit, found.carried).known):
+    for f, known in enumerate(without_each(found.fit, found.carried)):
         rows = fold_of(own.t, block_s(found.fit)) == f
         fit = found.fit.at(known.x)
         named = fit.with_named([e for e in fit.named if not e.is_pattern])

@@ -30,16 +30,7 @@ from adapter.gap.candidates import (
     signatures,
     simpler_wins,
 )
-from adapter.gap.evidence import (
-    BAND_HZ,
-    Carried,
-    Noise,
-    Score,
-    noise_of,
-    quiet_noise,
-    score,
-    scores,
-)
+from adapter.gap.evidence import BAND_HZ, Carried, Noise, Score, quiet_noise, score, scores
 from adapter.gap.fit import Fit
 from adapter.judgement.noise import LEAST_NM
 from adapter.model.spatial import Array
@@ -98,7 +89,7 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, weigh
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
     # of the residual that may be noise, for a start
-    sigma = 0.2 * noise_of(residual, weight).level + LEAST_NM
+    sigma = 0.2 * quiet_noise(residual, weight).level + LEAST_NM
     white, data = X[used], (residual / sigma).ravel()
     white *= weight / sigma
     data *= weight.ravel()

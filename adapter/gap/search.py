@@ -26,7 +26,7 @@ from adapter.gap.fit import (
     under_own_noise,
     worth,
 )
-from adapter.gap.folds import Folds, pays_held_out
+from adapter.gap.folds import pays_held_out, without_each
 from adapter.gap.laws import STRIBECK, falling, lawful, left_without
 from adapter.gap.real_arm import BRISTLES, COULOMB, start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
@@ -346,7 +346,7 @@ def worst(fit: Fit, values: Mapping[int, float]) -> int | None:
 
 def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
     """Places of named effects from `first` on that are not worth a name, and their nats."""
-    values, folds = {}, Folds.of(fit, carried)
+    values, others = {}, without_each(fit, carried)
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
         value = found.log_evidence + price(e) + e.candidate.effect.log_odds_of(e.values)
@@ -357,7 +357,7 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.possible
             or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
-            or not (from_the_start(e) or pays_held_out(fit, folds, k))
+            or not (from_the_start(e) or pays_held_out(fit, carried, others, k))
         ):
             values[k] = value
     return values

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from adapter.effects.by_joint import smooth_sign
 from adapter.effects.torque import ModelTorque
-from adapter.judgement.noise import USUAL_S, memory_s
+from adapter.judgement.noise import MEMORY_S, memory_s
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -140,7 +140,7 @@ def judge(
         for x, y in zip(parts, expected, strict=True)
     ]
     memory = [
-        np.full(len(part.alive), USUAL_S) if part.memory_s is None else part.memory_s
+        np.full(len(part.alive), MEMORY_S[0]) if part.memory_s is None else part.memory_s
         for part in parts
     ]
     for turn in range(ROUNDS):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.judgement.noise import USUAL_S
+from adapter.judgement.noise import MEMORY_S
 from adapter.judgement.posterior import Moments, Part, judge
 from adapter.judgement.priors import DOCUMENTED_SHARE, EFFECT_STD, theta_prior
 from adapter.learning.theta import PRIOR_STD, Theta, neutral_body
@@ -79,7 +79,7 @@ def learned_posterior(
     way[theta.spare] = way[hand]
     way[theta.spare, 10:20] = np.eye(10)
     way[theta.spare.stop :, effects] = np.eye(own.size)
-    memory = np.full(n, USUAL_S) if memory_s is None else memory_s
+    memory = np.full(n, MEMORY_S[0]) if memory_s is None else memory_s
     sums, counts = _sums(theta, way, way @ start), np.maximum(theta.moments.counts, 1.0)
     nowhere = np.zeros((0, n, len(std))), np.zeros((0, n))
     moments = Moments(period_s, counts, *sums, nowhere)

@@ -25,7 +25,7 @@ from adapter.effects.active import Active
 from adapter.effects.base import LearnedEffect
 from adapter.effects.by_joint import AT_REST, JointSignals, slowness
 from adapter.effects.catalogue import effects_by_name
-from adapter.judgement.noise import USUAL_S
+from adapter.judgement.noise import MEMORY_S
 from adapter.learning import theta_kernels as kernels
 from adapter.learning.known_effects import believed, told_shapes
 from adapter.learning.settings import LearnerSettings, Mode
@@ -514,7 +514,7 @@ class Theta:
         """
         squares = np.square(self.effect_values) + variance.reshape(len(self.effects), self.tree.n)
         held, own = AT_REST**2 * self.banded(squares), self.variance()
-        self.rests[:] = own / (own + held / USUAL_S)  # a second has so many independent ones
+        self.rests[:] = own / (own + held / MEMORY_S[0])  # a second has so many independent ones
 
     def _choose_shapes(self, shapes: Array | None) -> None:
         """Let effects act with shapes (e, n) from now on; with their first where there are none."""

@@ -68,10 +68,9 @@ def by_learn(log: adapter.Log, model: SelfModel) -> Numbers:
 def by_replay(log: adapter.Log, model: SelfModel) -> Numbers:
     """The same of the command."""
     with tempfile.TemporaryDirectory() as out:
-        robot = save_model(model, f"{out}/arm.json")
-        how = ("--quiet", "--no-report", "--every", str(EVERY), "--out", f"{out}/run")
-        asked = "replay", str(log.path), "--robot", str(robot), *how
-        done = subprocess.run((sys.executable, "-m", "adapter", *asked), capture_output=True)
+        robot, how = str(save_model(model, f"{out}/arm.json")), ("--every", str(EVERY), "--quiet")
+        asked = "replay", str(log.path), "--robot", robot, "--no-report", "--out", f"{out}/run"
+        done = subprocess.run((sys.executable, "-m", "adapter", *asked, *how), capture_output=True)
         if done.returncode not in (0, 9):  # nine: what was not shown is the documentation's
             raise ValueError(done.stderr.decode())
         return torques(adapter.load_model(f"{out}/run/model.json"), model)

@@ -17,18 +17,18 @@ from adapter.effects.active import WHOLE
 from adapter.effects.catalogue import HELD
 from adapter.gap import GapSettings, RecordingFault, RecordingRefused
 from adapter.gap.candidates import Candidate, log_odds, signatures, stages_of
-from adapter.gap.evidence import Noise
+from adapter.gap.evidence import Carried, Noise
 from adapter.gap.findings import doubted, findings_of, parameter_std, told_of
 from adapter.gap.fit import Fit, Model, Named, refitted, worth
 from adapter.gap.folds import (
     FOLD_S,
     FOLDS,
     LARGEST_SHARE,
-    Folds,
     block_s,
     fold_of,
     fold_rows,
     pays_held_out,
+    without_each,
 )
 from adapter.gap.held_out import (
     GapTask,
@@ -160,7 +160,7 @@ def test_what_one_block_alone_shows_is_not_named(throughout: bool) -> None:
     fit = with_effect(nominal_fit(recording(3, on_joint(6, 0.5 * on))), "torque_offset", 6, 0.5)
     fit, carried = refitted(fit)
     assert worth(fit, carried, 0).log_evidence > BELIEF + 20.0
-    assert pays_held_out(fit, Folds.of(fit, carried), 0) is throughout
+    assert pays_held_out(fit, carried, without_each(fit, carried), 0) is throughout
     assert worst(fit, weak(fit, carried)) == (None if throughout else 0)
 
 
@@ -168,13 +168,13 @@ def test_what_the_other_folds_leave_open_takes_nothing_from_an_effect() -> None:
     """A joint moves in two folds, in one of them beside what the others hardly show."""
     fit = with_effect(nominal_fit(recording(0)), "coulomb_friction", JOINT, FC)
     fold = np.repeat(np.arange(FOLDS), 200)
+    without = [fold >= 0, *(fold != f for f in range(FOLDS))]
     rows = np.zeros((len(fit.coefficients), len(fold)))
     rows[0], rows[-1] = np.choose(fold, [1.0, 0.0, 1e-3, 1e-3]), fold < 2
     for seed in range(10):
         data = rows[-1] + np.random.default_rng(seed).standard_normal(len(fold))
-        parts = [(rows[:, fold == f], data[fold == f]) for f in range(FOLDS)]
-        products = np.array([x @ x.T for x, _ in parts]), np.array([x @ y for x, y in parts])
-        assert pays_held_out(fit, Folds(*products, np.full(len(rows), 100.0)), 0)
+        known = [Carried(rows[:, on], np.full(len(rows), 100.0), data[on]) for on in without]
+        assert pays_held_out(fit, known[0], known[1:], 0)
 
 
 # ---------------------------------------------------------------- doubt

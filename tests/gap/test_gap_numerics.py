@@ -34,7 +34,6 @@ from adapter.gap.fit import (
     unsure,
     worth,
 )
-from adapter.gap.folds import Folds, fold_rows, pays_held_out
 from adapter.gap.hand import MASSES_KG, Hand
 from adapter.gap.held_out import possible
 from adapter.gap.rivals import Rival, Standing, standings
@@ -567,31 +566,6 @@ def test_a_rest_is_one_unknown_value_however_long_it_lasts():
 def _frictions(fit: Fit) -> list:
     found = signatures(stages_of(fit.recordings[0], ()), EVERYWHERE)[1]
     return [c for c in found if c.effect.name == "coulomb_friction"]
-
-
-def test_held_out_blocks_pay_for_what_is_there_and_not_for_what_is_not():
-    fit = fit_of(SHORT)
-    fold = fold_rows(fit)
-    assert len(fold) == len(fit.recordings[0].t) * N
-    assert set(fold) == {0, 1, 2, 3}
-    there = next(c for c in _frictions(fit) if c.joint == RUBS)
-    fit, carried = refitted(fit.with_named([Named(there, np.array([FC]))]))
-    assert pays_held_out(fit, Folds.of(fit, carried), 0)
-    shuffled = Carried(carried.N, carried.prior_std, -carried.data * np.sign(fold - 1.5))
-    assert not pays_held_out(
-        fit, Folds.of(fit, shuffled), 0
-    )  # another sign in every other pair of blocks
-
-
-def test_what_folds_leave_is_what_their_residuals_are():
-    """By products, as by the rows themselves."""
-    fit = fit_of(SHORT)
-    fit, carried = refitted(fit.with_named([Named(_frictions(fit)[RUBS], np.array([FC]))]))
-    fold, folds, direct = fold_rows(fit), Folds.of(fit, carried), 0.0
-    for f, known in enumerate(folds.known()):
-        left = (carried.data - known.x @ carried.N)[fold == f]
-        direct += float(left @ left)
-    assert folds.left(np.arange(len(carried.x))) == pytest.approx(direct, rel=1e-9)
 
 
 # ---------------------------------------------------------------- the scan
