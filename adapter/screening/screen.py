@@ -476,12 +476,11 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
         clear &= (t < stamps_s[k] - GRID_S * EDGE) | (t > stamps_s[k + 1] + GRID_S * EDGE)
     missing = stuck(stamps_s, log.dq, log.tau)
     held = np.flatnonzero(missing[:, ~missing.all(axis=0)].any(axis=1))
-    clear &= ~np.isin(np.searchsorted(stamps_s, t), held)
-    if not clear.any():
-        told = f"{log.path}: at no instant is every torque measured: they keep their values for"
-        told += " long while the arm moves (rounded?), or pauses leave no second between them."
-        raise RecordingRefused(RecordingFault.TORQUE, told)
-    q, dq, ddq, tau = (x[clear] for x in signals)
+    heard = clear & ~np.isin(np.searchsorted(stamps_s, t), held)
+    if clear.any() and not heard.any():
+        told = f"{log.path}: at no instant is every torque measured: each keeps its value for long"
+        raise RecordingRefused(RecordingFault.TORQUE, f"{told} while the arm moves (rounded?).")
+    q, dq, ddq, tau = (x[heard] for x in signals)
     return q, dq, ddq, tau
 
 
