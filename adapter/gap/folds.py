@@ -56,8 +56,8 @@ def without_each(fit: Fit, carried: Carried | Moments) -> list[Normal]:
     if isinstance(carried, Moments):
         products = list(zip(*carried.folds, strict=True))
     else:
-        rows = [fold_rows(fit) == f for f in range(FOLDS)]
-        parts = [(carried.N[:, on], carried.data[on]) for on in rows]
+        fold = fold_rows(fit)
+        parts = [(carried.N[:, fold == f], carried.data[fold == f]) for f in range(FOLDS)]
         products = [(N @ N.T, N @ data) for N, data in parts]
     return [Normal(carried.G - G, carried.g - g, carried.prior_std) for G, g in products]
 

@@ -90,9 +90,8 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, weigh
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
     # of the residual that may be noise, for a start
     sigma = 0.2 * quiet_noise(residual, weight).level + LEAST_NM
-    white, data = X[used], (residual / sigma).ravel()
+    white, data = X[used], (residual * weight / sigma).ravel()
     white *= weight / sigma
-    data *= weight.ravel()
     white = white.reshape(len(used), -1)
     for _ in range(2):
         information = white @ white.T
