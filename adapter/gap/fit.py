@@ -341,8 +341,9 @@ class Fit:
 
     @cached_property
     def weights(self) -> tuple[Array, ...]:
-        """(k, n) share of its noise in what a row may be off by, per recording."""
-        parts = zip(self.noise, self.doubts, strict=True)
+        """(k, n) or (n,) share of its noise in what a row may be off by, per recording."""
+        none = (np.zeros(self.n),) * len(self.noise)
+        parts = zip(self.noise, self.doubts or none, strict=True)
         return tuple(own.level / np.sqrt(own.level**2 + doubt) for own, doubt in parts)
 
     def noise_of(self, left: Sequence[Array]) -> tuple[Noise, ...]:
@@ -405,12 +406,8 @@ class Fit:
 
     def whiten(self, tables: Sequence[Array]) -> Array:
         """Tables (..., k, n), one per recording, white and in one row each (..., r)."""
-        white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
-        for x, own in zip(white, self.recordings, strict=True):
-            x *= own.heard
-        if self.doubts:
-            for x, weight in zip(white, self.weights, strict=True):
-                x *= weight
+        parts = zip(self.recordings, self.noise, self.weights, tables, strict=True)
+        white = [noise.whiten(x) * (own.heard * weight) for own, noise, weight, x in parts]
         flat = [x.reshape(*x.shape[:-2], -1) for x in white]
         return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=-1)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from adapter.effects.catalogue import LATENESS
 from adapter.gap.evidence import Carried, Moments, Normal
-from adapter.gap.fit import Fit, beside
+from adapter.gap.fit import Fit, beside, place_of
 from adapter.model.spatial import Array
 
 FOLDS = 4
@@ -73,7 +73,10 @@ def pays_held_out(fit: Fit, every: Normal, others: Sequence[Normal], k: int) -> 
         every: what is known of the fit's coefficients; others: see `without_each`.
     """
     own, rest = beside(fit, k)
-    if fit.named[k].candidate.effect is LATENESS:  # the carried error would stand for it
-        rest = rest[rest != fit.dtheta.size]
+    one = fit.named[k].candidate
+    alike = (i for i, e in enumerate(fit.named) if e.assumed and e.candidate.key == one.key)
+    small = [fit.dtheta.size] if one.effect is LATENESS else []
+    small += [place for i in alike for place in place_of(fit, i)]
+    rest = rest[~np.isin(rest, small)]  # what any arm has of its kind would stand for it
     value, *parts = (x.worth(own, rest).log_evidence for x in (every, *others))
     return FOLDS * value - sum(parts) > FORETOLD * value

@@ -1,7 +1,7 @@
 """Looking for the next effect: every template, in every joint, at all times or from some time on.
 
-Times are scanned in blocks of 0.4 s through running sums of the products, so that a start costs
-no more than a small solve.
+Times are scanned in blocks through running sums of the products, so that a start costs no more
+than a small solve.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from adapter.model.spatial import Array
 
 CATALOGUED, PATTERNS, FORMS = "catalogued", "patterns", "forms"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
+SUDDEN_S = 0.1  # the same of what comes at once: a moment without it may say more than seconds with
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 AT_ONCE = 24  # candidates of a long recording
 LONGEST_CONTACT_S = 8.0
@@ -138,7 +139,7 @@ class SignatureTable:
             table, self.candidates = signatures(stages[i], joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
-                weight = fit.recordings[i].sliding * (fit.weights[i] if fit.doubts else 1.0)
+                weight = fit.recordings[i].sliding * fit.weights[i]
                 noise.append(rich_noise(table, self.candidates, fit.model.residual(i), weight))
         if kind != CATALOGUED:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern | Law)]
@@ -288,10 +289,12 @@ class SignatureTable:
         """The best start of each candidate in each recording."""
         leads = []
         for i, t in enumerate(self.times):
-            edges = _edges(t)
-            inside = (edges > t[0] + MARGIN_S) & (edges < t[-1] - MARGIN_S)
-            pairs = [(int(a), len(edges) - 1) for a in np.flatnonzero(inside)]
-            leads += self._best_intervals(i, candidates, pairs, passing=False)
+            for sudden, block_s in ((True, SUDDEN_S), (False, BLOCK_S)):
+                edges = _edges(t, block_s)
+                inside = (edges > t[0] + MARGIN_S) & (edges < t[-1] - MARGIN_S)
+                pairs = [(int(a), len(edges) - 1) for a in np.flatnonzero(inside)]
+                own = [c for c in candidates if c.effect.sudden is sudden]
+                leads += self._best_intervals(i, own, edges, pairs)
         return leads
 
     def passing(self, candidates: Sequence[Candidate]) -> list[Lead]:
@@ -299,27 +302,28 @@ class SignatureTable:
         leads = []
         longest = round(LONGEST_CONTACT_S / BLOCK_S)
         for i, t in enumerate(self.times):
-            last = len(_edges(t)) - 1
+            edges = _edges(t, BLOCK_S)
+            last = len(edges) - 1
             ends = [(a, min(a + longest, last - 1)) for a in range(1, last)]
             pairs = [(a, b) for a, end in ends for b in range(a + 1, end + 1)]
-            edges = _edges(t)  # no push lasts for what was left out between two stretches
+            # no push lasts for what was left out between two stretches
             pairs = [(a, b) for a, b in pairs if edges[b] - edges[a] < LONGEST_CONTACT_S + BLOCK_S]
-            leads += self._best_intervals(i, candidates, pairs, passing=True)
+            leads += self._best_intervals(i, candidates, edges, pairs, passing=True)
         return leads
 
     def _best_intervals(
         self,
         recording: int,
         candidates: Sequence[Candidate],
+        edges: Array,
         pairs: Sequence[tuple[int, int]],
-        passing: bool,
+        passing: bool = False,
     ) -> list[Lead]:
-        """Of each candidate the best of the intervals between these edges of a recording."""
-        if not pairs:
+        """Of each candidate the best of the intervals between pairs of a recording's edges."""
+        if not (pairs and candidates):
             return []
-        edges, first, last = _edges(self.times[recording]), *np.array(pairs).T
-        leads = []
-        for c, sums in zip(candidates, self._running(recording, candidates), strict=True):
+        (first, last), leads = np.array(pairs).T, []
+        for c, sums in zip(candidates, self._running(recording, candidates, edges), strict=True):
             reduced = self.carried.reduced(*(x[first] - x[last] for x in sums))
             evidences, chi2, x = scores(*reduced, c.prior_std)
             best = int(np.argmax(evidences))
@@ -330,7 +334,7 @@ class SignatureTable:
         return leads
 
     def _running(
-        self, recording: int, candidates: Sequence[Candidate]
+        self, recording: int, candidates: Sequence[Candidate], edges: Array
     ) -> Iterator[tuple[Array, Array, Array]]:
         """Of each candidate sums from each edge to the end of its products.
 
@@ -339,12 +343,11 @@ class SignatureTable:
         """
         if len(self.fit.recordings[recording].begins) > 1 and len(candidates) > AT_ONCE:
             for first in range(0, len(candidates), AT_ONCE):  # all at once take much memory
-                yield from self._running(recording, candidates[first : first + AT_ONCE])
+                yield from self._running(recording, candidates[first : first + AT_ONCE], edges)
             return
         t, n = self.times[recording], self.fit.n
         begin = sum(len(x) for x in self.times[:recording]) * n
         rows = slice(begin, begin + len(t) * n)
-        edges = _edges(t)
         block = np.repeat(np.searchsorted(edges, t, side="right") - 1, n)
         cuts = np.searchsorted(block, np.arange(len(edges)))
         parts = [slice(a, b) for a, b in pairwise(cuts)]
@@ -360,14 +363,14 @@ class SignatureTable:
             yield own, whole[:, at, :-1], whole[:, at, -1]
 
 
-def _edges(t: Array) -> Array:
+def _edges(t: Array, block_s: float) -> Array:
     """(b,) edges of the blocks of a recording's instants, the last one behind its end.
 
     Where time is left out, the block before lasts all that time.
     """
     cuts = np.flatnonzero(np.diff(t) > BLOCK_S)
     begins, ends = t[np.append(0, cuts + 1)], t[np.append(cuts, len(t) - 1)]
-    parts = [np.arange(a, b, BLOCK_S) for a, b in zip(begins, ends, strict=True)]
+    parts = [np.arange(a, b, block_s) for a, b in zip(begins, ends, strict=True)]
     return np.append(np.concatenate(parts), t[-1] + 1.0)
 
 

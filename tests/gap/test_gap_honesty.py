@@ -38,6 +38,7 @@ from adapter.gap.held_out import (
     torque_errors,
     uncorrected,
 )
+from adapter.gap.real_arm import real_arm
 from adapter.gap.result import Leftover
 from adapter.gap.rivals import DATES, Standing, price
 from adapter.gap.scan import BELIEF
@@ -82,9 +83,8 @@ def on_joint(joint: int, torque: Array) -> Array:
 def nominal_fit(own: Recorded) -> Fit:
     """The nominal model under the white noise that was added: nothing is estimated of it."""
     signals = (prepare(own, ARM),)
-    level = np.full(N, float(np.std(signals[0].low(np.random.default_rng(0).standard_normal(
-        (len(signals[0].motion.t), N))))) * NOISE_NM)  # fmt: skip
-    noise = Noise(level, np.ones(N))
+    white = np.random.default_rng(0).standard_normal((len(signals[0].motion.t), N))
+    noise = Noise(np.full(N, NOISE_NM * np.std(signals[0].low(white))), np.ones(N))
     model = Model(signals, np.zeros_like(ARM.theta))
     return Fit(model, theta_prior(ARM.theta, PRIOR)).with_noise([noise])
 
@@ -162,6 +162,16 @@ def test_what_one_block_alone_shows_is_not_named(throughout: bool) -> None:
     assert worth(fit, carried, 0).log_evidence > BELIEF + 20.0
     assert pays_held_out(fit, carried, without_each(fit, carried), 0) is throughout
     assert worst(fit, weak(fit, carried)) == (None if throughout else 0)
+
+
+def test_what_any_arm_has_of_a_kind_takes_nothing_from_a_larger_one() -> None:
+    """Springs of cables are small; where one is not, its blocks confirm that, and no prior."""
+    bare = nominal_fit(recording(4, on_joint(0, -0.8 * MOVED[0][:, 0])))
+    fit = real_arm(bare, range(N), ()).fit.with_noise(bare.noise)
+    spring = Named(candidate(fit, "joint_spring", 0), np.zeros(2))
+    assert any(e.assumed and e.candidate.key == spring.candidate.key for e in fit.named)
+    fit, carried = refitted(fit.with_named([*fit.named, spring]))
+    assert pays_held_out(fit, carried, without_each(fit, carried), len(fit.named) - 1)
 
 
 def test_what_the_other_folds_leave_open_takes_nothing_from_an_effect() -> None:
