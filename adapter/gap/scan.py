@@ -41,7 +41,6 @@ SUDDEN_S = 0.1  # the same of what comes at once: a moment without it may say mo
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 AT_ONCE = 24  # candidates of a long recording
 LONGEST_CONTACT_S = 8.0
-MARGIN_S = 0.8  # a start so near either end is no change
 
 
 BELIEF = 8.0  # nats that a finding is worth after the price of looking for it
@@ -291,7 +290,8 @@ class SignatureTable:
         for i, t in enumerate(self.times):
             for sudden, block_s in ((True, SUDDEN_S), (False, BLOCK_S)):
                 edges = _edges(t, block_s)
-                inside = (edges > t[0] + MARGIN_S) & (edges < t[-1] - MARGIN_S)
+                # a start near either end is no change
+                inside = (edges > t[0] + 2.0 * BLOCK_S) & (edges < t[-1] - 2.0 * BLOCK_S)
                 pairs = [(int(a), len(edges) - 1) for a in np.flatnonzero(inside)]
                 own = [c for c in candidates if c.effect.sudden is sudden]
                 leads += self._best_intervals(i, own, edges, pairs)

@@ -37,7 +37,7 @@ from adapter.gap.fit import (
 from adapter.gap.hand import MASSES_KG, Hand
 from adapter.gap.held_out import possible
 from adapter.gap.rivals import Rival, Standing, standings
-from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
+from adapter.gap.scan import BELIEF, BLOCK_S, PATTERNS, SUDDEN_S, SignatureTable, honest_moves
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
 from adapter.judgement.noise import LEAST_NM
 from adapter.judgement.priors import theta_prior
@@ -594,13 +594,11 @@ def gated(
 @pytest.mark.parametrize("key", [("coulomb_friction", RUBS), ("torque_offset", 0), ("payload", -1)])
 def test_running_sums_are_sums(key: tuple[str, int], field: SignatureTable):
     c = next(c for c in field.candidates if c.key == key)
-    t = field.times[0]
-    starts = np.arange(t[0], t[-1], BLOCK_S)
-    starts = starts[(starts > t[0] + MARGIN_S) & (starts < t[-1] - MARGIN_S)]
-    each = [
-        score(*field.carried.without(gated(field, c.columns, begin)), c.prior_std)
-        for begin in starts
-    ]
+    t, margin = field.times[0], 2 * BLOCK_S
+    starts = np.arange(t[0], t[-1], SUDDEN_S if c.effect.sudden else BLOCK_S)
+    starts = starts[(starts > t[0] + margin) & (starts < t[-1] - margin)]
+    gates = (gated(field, c.columns, begin) for begin in starts)
+    each = [score(*field.carried.without(gate), c.prior_std) for gate in gates]
     best = int(np.argmax([x.log_evidence for x in each]))
     lead = field.timed([c])[0]
     assert lead.interval_s == (pytest.approx(starts[best]), np.inf)
