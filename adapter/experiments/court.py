@@ -222,7 +222,10 @@ def heard(
         learned, cost = found
         if way == OURS:
             findings = [{**x, "interval_s": None} for x in learned.findings]
-        verdicts.append(case.verdict(way, learned, **cost))
+        try:
+            verdicts.append(case.verdict(way, learned, **cost))
+        except (ModelError, ValueError, np.linalg.LinAlgError) as error:
+            verdicts.append(Verdict(way, notes=[f"what it learned cannot be judged: {error}"]))
     return verdicts
 
 
