@@ -57,7 +57,7 @@ class Active:
         stds = {key: self.std.get(key) for key in self.values}
         known = {key: std for key, std in stds.items() if std is not None}
         return not known or any(
-            np.any(np.abs(np.asarray(self.values[key], float)) > SHOWN_STD * std)
+            np.any(np.abs(np.asarray(self.values[key], float)) > SHOWN_STD * np.asarray(std, float))
             for key, std in known.items()
         )
 

@@ -61,21 +61,32 @@ def bench(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Times one update of λ and θ of a Panda beside autograd through the torch "
         "networks, Pinocchio's regressor with recursive least squares (if pin is installed) and "
-        "differentiable-robot-model (extra [peers], if installed). With --log also compares the "
-        "torque that ours and figaroh (extra [peers]) leave on the part not learned from."
+        "differentiable-robot-model (extra [peers], if installed). With --log it compares ways to "
+        "learn that arm instead, each told the documented model and the recording and run in a "
+        "process of its own: adapter gap and replay, least squares, and, where extra [peers] is "
+        "installed, figaroh, mujoco.sysid and CMA-ES: unseen torque, rollouts, time, memory."
     )
     add = parser.add_argument
     add("--repeats", type=int, default=2000, metavar="N", help="default 2000")
-    add("--log", type=Path, metavar="LOG", help="recording of an arm to compare held-out torque on")
+    add("--log", type=Path, metavar="LOG", help="recording of an arm to compare ways to learn on")
+    add("--hold-out", type=Path, metavar="LOG", help="judge on this one, learn from all of --log")
     add("--robot", default="panda", metavar="NAME|FILE", help="the arm as documented")
-    said = "learn before this second of LOG, score after it; default 14"
-    add("--validate-from", type=float, default=14.0, metavar="S", help=said)
+    said = "learn before this second of LOG, judge after it (default: two thirds)"
+    add("--validate-from", type=float, metavar="S", help=said)
+    add("--only", nargs="+", metavar="WAY", help="of --log these ways, by the names in its table")
+    said = "iterations of mujoco.sysid; CMA-ES has ten times as many (default 20)"
+    add("--rounds", type=int, default=20, metavar="N", help=said)
+    add("--limit", type=float, default=1800.0, metavar="S", help="for each way (default 1800)")
+    add("--out", type=Path, metavar="FOLDER", help="where results go")
     add("--json", type=Path, metavar="FILE", help="write the figures")
     parser.set_defaults(check=_check_bench)
 
 
 def _check_bench(args: argparse.Namespace) -> None:
     """Raises UsageError or OSError for what would end it minutes later."""
-    if args.log is not None and not args.log.is_file():
-        raise UsageError(f"{args.log}: no such recording")
+    for path in (args.log, args.hold_out):
+        if path is not None and not path.exists():
+            raise UsageError(f"{path}: no such recording")
+    if args.hold_out is not None and (args.log is None or args.validate_from is not None):
+        raise UsageError("--hold-out goes with --log, and without --validate-from")
     check_writable(args.json)

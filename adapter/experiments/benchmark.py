@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import importlib.metadata
 import importlib.util
-import io
 import os
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -22,6 +18,8 @@ from rich.table import Table
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot, robot_urdf
 from adapter.effects.torque import ModelTorque
+from adapter.experiments.court import Case, first, heard, tables, write_court
+from adapter.experiments.rivals import WAYS
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.learning.theta import Filtered
@@ -31,29 +29,25 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.networks import inverse_dynamics, link_motion, theta_from_log_cholesky_torch
 from adapter.runs.config import PipelineSettings
-from adapter.runs.library import find_gap, learn
 from adapter.runs.pipeline import make_front_end
-from adapter.runs.replay import seconds
-from adapter.runs.terminal import output, write_json
+from adapter.runs.terminal import output, say, show, write_json
 from adapter.signals.filters import JointFilter
-from adapter.signals.matching import matching
-from adapter.signals.validation import EDGE_S, GRID_S, smooth
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import read_log
 from drivers.interface import JointSample
 
 WARM_UP = 2500  # samples, so that λ has settled and θ is being learned
 MOST_SLOW_REPEATS = 100
-# Torque RMSE of joints 1 to 7, N m, that figaroh 1.0.2 leaves of the log of a real Panda (Gaz et
-# al. 2019) after 14 s, learned before; measured by `adapter bench --log`.
+# What figaroh 1.0.2 leaves of the log of a real Panda (Gaz et al. 2019) after 14 s, learned before;
+# measured by `adapter bench --log`.
 STATED_RMSE_NM = (0.157, 0.223, 0.139, 0.167, 0.063, 0.042, 0.049)
-STATED = "stated: figaroh 1.0.2, log of Gaz et al. 2019, learned on 14 s"
+STATED = "unseen torque of figaroh 1.0.2, log of Gaz et al. 2019, N m rms by joint:"
 MISSING = "extra [peers] is not installed"
-
-Signals = tuple[Array, Array, Array, Array]
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
+    if args.log is not None:
+        return _compare(args)
     rows = benchmark(max(args.repeats, 10))
     table = Table("what", "p50 µs", "p99 µs", "note", box=None, pad_edge=False)
     for row in rows:
@@ -61,14 +55,25 @@ def run(args: argparse.Namespace) -> int:
         shown = ("-", "-") if p50 is None else (f"{p50:.1f}", f"{p99:.1f}")
         table.add_row(row["what"], *shown, row["note"])
     output.print(table)
-    unseen = [stated()]  # what figaroh is known to leave
-    if args.log is not None:
-        unseen = held_out(read_log(args.log), read_robot(args.robot), args.validate_from)
-    table = Table("unseen torque", "rmse by joint, N m", "note", box=None, pad_edge=False)
-    for row in unseen:
-        table.add_row(row["what"], " ".join(f"{x:.3f}" for x in row["rmse_nm"]), row["note"])
-    output.print(table)
-    write_json(args.json, {"rows": rows, "held_out": unseen})
+    output.print(STATED, *STATED_RMSE_NM)
+    write_json(args.json, {"rows": rows, "stated_rmse_nm": STATED_RMSE_NM})
+    return 0
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """The ways to learn, side by side on a recording."""
+    unseen = None if args.hold_out is None else read_log(args.hold_out)
+    case = Case.of(read_log(args.log), read_robot(args.robot), args.validate_from, unseen)
+    verdicts = heard(case, args.only or list(WAYS), args.limit, args.rounds, say)
+    for shown in tables(verdicts):
+        table = Table(*shown.heads, box=None, pad_edge=False)
+        for row in shown.rows:
+            table.add_row(*row)
+        output.print(table, "")
+    show(first(verdicts))
+    write_json(args.json, {"ways": [v.as_json() for v in verdicts], "said": first(verdicts)})
+    if args.out is not None:
+        show(f"page: {write_court(verdicts, case, args.out / 'court.html')}")
     return 0
 
 
@@ -210,103 +215,3 @@ def _peer(repeats: int) -> dict[str, Any]:
         adam.step()
 
     return _row(what, _timed(step, range(repeats)), "one sample, link masses alone")
-
-
-# --- torque of a log that none of the ways to learn has seen --------------------------------------
-
-
-def held_out(log: Log, robot: SelfModel, split_s: float) -> list[dict[str, Any]]:
-    """One row per way to learn: what, rmse_nm (n,) N m on the log after `split_s`, note.
-
-    All are learned before that second and scored after it. figaroh (Apache-2.0,
-    https://github.com/thanhndv212/figaroh-plus) identifies base parameters by weighted least
-    squares. It is set up as its users would: viscous and Coulomb friction, an offset and a motor
-    inertia in every joint.
-
-    Raises:
-        SettingsError: `split_s` is outside the log.
-        ValueError: the log is of another robot, or a part of it is too short.
-    """
-    online = learn(log, robot, validate_from_s=split_s).held_out_rmse_nm
-    batch = find_gap(log, robot, validate_from_s=split_s).after.torque_rmse_nm
-    rows = [_left("ours, online", online, "one pass"), _left("ours, `gap`", batch, "")]
-    if importlib.util.find_spec("figaroh") is None:
-        return [*rows, stated()]
-    version = importlib.metadata.version("figaroh")
-    rmse = figaroh_rmse(matching(log, robot), robot, split_s)
-    return [*rows, _left(f"figaroh {version}", rmse, "weighted least squares")]
-
-
-def stated() -> dict[str, Any]:
-    """figaroh's row where it, or its log, is not there."""
-    missing = importlib.util.find_spec("figaroh") is None
-    note = f"{STATED}; {MISSING}" if missing else STATED
-    return _left("figaroh", np.array(STATED_RMSE_NM), note)
-
-
-def _left(what: str, rmse: Array, note: str) -> dict[str, Any]:
-    return {"what": what, "rmse_nm": np.asarray(rmse).tolist(), "note": note}
-
-
-def figaroh_rmse(log: Log, robot: SelfModel, split_s: float) -> Array:
-    """Torque RMSE (n,) N m on the log after `split_s`, identified before it, by our recipe."""
-    late, edge = seconds(log) >= split_s, round(EDGE_S / GRID_S)
-    parts: list[Signals] = []
-    for rows in (~late, late):
-        q, dq, ddq, tau = smooth(seconds(log)[rows], log.q[rows], log.dq[rows], log.tau[rows])
-        parts.append((q[edge:-edge], dq[edge:-edge], ddq[edge:-edge], tau[edge:-edge]))
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")  # of its compiled parts, which register a type twice
-        error = _errors(robot, *parts)
-    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
-
-
-def _errors(robot: SelfModel, learned: Signals, unseen: Signals) -> Array:
-    """Torque errors (m, n) N m on `unseen` of what figaroh identifies from `learned`."""
-    from figaroh.identification.base_identification import BaseIdentification
-    from figaroh.tools.load_robot import load_robot
-    from figaroh.tools.regressor import build_regressor_basic
-
-    class Identification(BaseIdentification):
-        """Its workflow on signals that are filtered already."""
-
-        def load_trajectory_data(self, data_source: str | None = None) -> dict[str, Array]:
-            names = ("positions", "velocities", "accelerations", "torques")
-            times: Array = GRID_S * np.arange(len(learned[0]), dtype=np.float64)
-            return {"timestamps": times, **dict(zip(names, learned, strict=True))}
-
-        def process_kinematics_data(self, filter_config: object = None) -> None:
-            self.processed_data = dict(self.raw_data)
-
-    with tempfile.TemporaryDirectory() as folder:
-        urdf, settings = Path(folder) / "arm.urdf", Path(folder) / "settings.yaml"
-        urdf.write_text(robot_urdf(robot, alone=True).text)
-        settings.write_text(_settings(robot))
-        arm = load_robot(os.fspath(urdf), load_by_urdf=True)
-        work = Identification(arm, os.fspath(settings))
-    joints = list(range(robot.tree.n))
-    work.identif_config.update(act_idxq=joints, act_idxv=joints)
-    work.initialize()
-    found = work.solve(decimate=False, plotting=False, wls=True)
-    Y = build_regressor_basic(arm, *unseen[:3], work.identif_config)
-    Y = np.delete(Y, work._idx_eliminated, axis=1)[:, work._base_indices]
-    return np.asarray(unseen[3] - (Y @ found).reshape(robot.tree.n, -1).T)
-
-
-def _settings(robot: SelfModel) -> str:
-    """Its file of settings: every joint with friction, offset and motor inertia, as from zero."""
-    names, zeros = ", ".join(robot.tree.joint_names), [0] * robot.tree.n
-    return f"""
-robot:
-  name: arm
-  properties: {{joints: {{active_joints: [{names}]}}}}
-tasks:
-  identification:
-    type: identification
-    problem:
-      model_components: {{friction: true, actuator_inertia: true, joint_offset: true}}
-    mechanics:
-      friction_coefficients: {{viscous: {zeros}, static: {zeros}}}
-      actuator_inertias: {zeros}
-      joint_offsets: {zeros}
-"""

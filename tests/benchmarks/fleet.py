@@ -11,22 +11,19 @@ from __future__ import annotations
 import argparse
 import heapq
 import json
-import math
 import os
-import re
 import shutil
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from adapter.effects.robots import documented, robot_mjcf, robot_urdf
+from adapter.effects.robots import documented, robot_urdf
 from adapter.effects.torque import ModelTorque
+from adapter.experiments.rivals import of_this_process, sysid
 from adapter.runs.fleet.fleet import Settings, found_logs, here, learn_fleet
 from adapter.runs.fleet.moments import Task, content_of
 from adapter.signals.validation import smooth
@@ -37,7 +34,6 @@ SEED = 11
 NOISE = 1e-5, 1e-3, 0.05  # rad, rad/s, N m
 FAILS_AN_HOUR, AWAY_S = 0.01, 600.0  # chance of a machine, and how long it is away then
 SLOW_SHARE, SLOW = 0.05, 4.0  # stragglers, and how many times longer they take
-SEGMENT_S = 0.1  # that mujoco.sysid simulates from a measured state; longer ones run away
 SYSID_ROUNDS = 5  # of its optimizer
 
 
@@ -99,67 +95,12 @@ def plain_loop(logs: list[str]) -> None:
 
 def mujoco_sysid(logs: list[str]) -> dict[str, float]:
     """The same parameters by `mujoco.sysid`: ten of each link, damping and dry friction."""
-    import mujoco
-    from mujoco import sysid
-
-    model = documented("panda")
-    spec = mujoco.MjSpec.from_string(robot_mjcf(model).text)
-    spec.option.timestep = 1e-3
-    for name in model.tree.joint_names:
-        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        for kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL):
-            sensor = f"{name}_{kind.name}"
-            spec.add_sensor(name=sensor, type=kind, objname=name, objtype=mujoco.mjtObj.mjOBJ_JOINT)
-    compiled = spec.compile()
-    parameters = sysid.ParameterDict()
-    for name in model.tree.joint_names:
-        body = compiled.body(compiled.joint(name).bodyid[0]).name
-        kind, change = sysid.InertiaType.Pseudo, partial(_set_of_body, body)
-        parameters.add(sysid.body_inertia_param(spec, compiled, body, kind, modifier=change))
-        for effect, most in (("damping", 5.0), ("frictionloss", 5.0)):
-            change = partial(_set_of_joint, name, effect)
-            own = sysid.Parameter(f"{name}_{effect}", 0.1, 0.0, most, modifier=change)
-            parameters.add(own)
-    states, controls, sensors, names = [], [], [], []
-    step = round(SEGMENT_S / spec.option.timestep)
-    for path in logs:
-        log = read_log(path)
-        seconds = 1e-3 * np.arange(step)
-        measured = np.stack([log.q, log.dq], axis=2).reshape(len(log), -1)
-        for start in range(0, len(log) - step, step):
-            part = slice(start, start + step)
-            states.append(sysid.create_initial_state(compiled, log.q[start], log.dq[start], None))
-            controls.append(sysid.TimeSeries(seconds, log.tau[part]))
-            sensors.append(sysid.TimeSeries.from_names(seconds, measured[part], compiled))
-            names.append(f"{path}:{start}")
-    whole = sysid.ModelSequences("panda", spec, names, states, controls, sensors)
-    residual = sysid.build_residual_fn(models_sequences=[whole], n_threads=1)
-    begin, _, _ = residual(parameters.as_vector(), parameters)
-    best, _ = sysid.optimize(parameters, residual, verbose=False, max_iters=SYSID_ROUNDS)
-    end, _, _ = residual(best.as_vector(), best)
-    first, last = (float(np.sqrt(np.mean(np.concatenate(x) ** 2))) for x in (begin, end))
-    damping = [best[f"{name}_damping"].value[0] for name in model.tree.joint_names]
-    return {"residual_before": first, "after": last, "damping": float(np.median(damping))}
-
-
-def _set_of_body(name: str, spec: Any, parameter: Any) -> None:
-    """Its own function for this takes bodies without geometries for empty."""
-    from mujoco import sysid
-
-    pi = sysid.model_modifier.pi_from_theta(parameter.value)
-    body, centre = spec.body(name), pi[1:4] / pi[0]
-    about = pi[4:].reshape(3, 3) - pi[0] * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    sizes, axes = np.linalg.eigh(about)
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
-    body.mass, body.ipos, body.inertia = float(pi[0]), centre, sizes
-    body.iquat = np.roll(Rotation.from_matrix(axes).as_quat(), 1)
-    body.explicitinertial = True
-
-
-def _set_of_joint(name: str, effect: str, spec: Any, parameter: Any) -> None:
-    joint, value = spec.joint(name), float(parameter.value[0])
-    as_now = np.atleast_1d(getattr(joint, effect))  # damping is a polynomial in the speed
-    setattr(joint, effect, np.r_[value, 0.0 * as_now[1:]] if len(as_now) > 1 else value)
+    read, joints = map(read_log, logs), range(7)
+    free = dict.fromkeys(("bodies", "viscous_friction", "coulomb_friction"), joints)
+    signals = [(log.q, log.dq, log.tau) for log in read]
+    found, (before, after) = sysid(documented("panda"), signals, free, SYSID_ROUNDS)
+    damping = next(e for e in found.effects if e["effect"] == "viscous_friction")["parameters"]
+    return {"residual_before": before, "after": after, "damping": float(np.median(damping["Fv"]))}
 
 
 def in_a_process(arguments: list[str]) -> dict[str, Any]:
@@ -171,12 +112,6 @@ def in_a_process(arguments: list[str]) -> dict[str, Any]:
         return {"cannot": done.stderr.splitlines()[-1]}
     own = json.loads(done.stdout.splitlines()[-1])
     return {"wall_s": time.perf_counter() - started, **own}
-
-
-def of_this_process() -> dict[str, float]:
-    """Processor time, s, and most memory, MB, so far."""
-    peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    return {"cpu_s": time.process_time(), "peak_mb": int(peak[1]) / 1024 if peak else math.nan}
 
 
 def schedule(tasks: int, task_s: float, head_s: float, machines: int) -> dict[str, float]:

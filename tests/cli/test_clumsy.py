@@ -29,8 +29,9 @@ FILES = {  # the words after a command, FILE being what cannot be used
     "report": ["FILE"],
     "recover": ["FILE"],
     "info": ["FILE"],
+    "bench": ["--log", "FILE"],
 }
-WITHOUT = {"sim", "experiment", "bench", "completion"}  # take no file as such
+WITHOUT = {"sim", "experiment", "completion"}  # take no file as such
 EMPTY = ("empty.mcap", "empty.json", "empty.urdf", "empty.csv")
 USELESS = ("gone.mcap", "folder", "noise.mcap", *EMPTY)
 NOISE = bytes(range(256)) * 8

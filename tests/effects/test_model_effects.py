@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.effects.active import lasting_effects, with_bodies
+from adapter.effects.active import active_effects, lasting_effects, with_bodies
 from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -315,3 +315,11 @@ def test_effects_need_an_arm() -> None:
     known = lasting_effects(model.effects, N)
     with pytest.raises(SettingsError, match="model's arm"):
         OnlineLearner(model.tree, model.gravity, known=KnownArm(effects=known))
+
+
+def test_a_wrong_link_read_from_a_file_is_more_than_noise() -> None:
+    """Its ten numbers and their doubts are lists there."""
+    for size, shown in ((0.1, True), (0.02, False)):
+        own = {"parameters": {"dtheta": [size] * 10}, "std": {"dtheta": [0.01] * 10}}
+        (active,) = active_effects([{"effect": "link_inertia", "joints": [2], **own}], 7)
+        assert active.shown == shown
