@@ -93,7 +93,7 @@ def not_learned(model: SelfModel, names: Sequence[str]) -> list[str]:
     said = [f"the learner leaves out {x}" for x in by_joint(lasting, whole.tree.n).left_out]
     laws = [x for x in lasting if isinstance(x.effect, OverSignals) and not x.starts(names)]
     held = "stays as it is: it is not learned online"
-    return said + [f"{x.effect.title} of joint {x.joint + 1} {held}" for x in laws]
+    return said + [f"joint {x.joint + 1}: {x.effect.title}, {held}" for x in laws]
 
 
 def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Array, Array] | None:

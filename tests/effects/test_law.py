@@ -229,7 +229,7 @@ def test_coefficients_of_laws_in_a_model_are_learned_on() -> None:
     names = learnable(learned.model, ())
     assert set(names) == set(learned.effects) and "law: max(q - a, 0)² at a = 0.04" in names
     *_, said = not_learned(learned.model, names)
-    assert said.startswith("torque of c tau² of joint 5 stays as it is")
+    assert said.startswith("joint 5: torque of c tau², stays as it is")
 
 
 def test_a_kept_law_is_learned_at_the_setting_that_the_model_has(tmp_path: Path) -> None:
