@@ -145,21 +145,17 @@ class Engine:
         # Where nothing depends on the motion the state is only asked for at the tick's end.
         acting = len(self._rows) or self._wrenches or self._end_stops or len(self.obstacles)
         free = not acting and not law.kp.any() and not law.kd.any()
+        motors = stage.arm, self._joints, bullet.TORQUE_CONTROL
+        within = {"physicsClientId": stage.client}
         for i in range(self._substeps):
             part = (i + 0.5) / self._substeps
             ff = law.ff0 + part * (law.ff1 - law.ff0)
             rigid = self._reaching(t + part * PERIOD_S, stored, dq, law, ff, ahead)
-            bullet.setJointMotorControlArray(
-                stage.arm,
-                self._joints,
-                bullet.TORQUE_CONTROL,
-                forces=(rigid - ahead).tolist(),
-                physicsClientId=stage.client,
-            )
-            bullet.stepSimulation(physicsClientId=stage.client)
+            bullet.setJointMotorControlArray(*motors, forces=(rigid - ahead).tolist(), **within)
+            bullet.stepSimulation(**within)
             if free and i < self._substeps - 1:
                 continue
-            states = bullet.getJointStates(stage.arm, self._joints, physicsClientId=stage.client)
+            states = bullet.getJointStates(stage.arm, self._joints, **within)
             both = np.array([state[:2] for state in states])
             stored, speed = both[:, 0].copy(), both[:, 1].copy()
             if len(self._bent):

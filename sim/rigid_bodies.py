@@ -103,33 +103,20 @@ def load_urdf(text: str, client: int, fixed: bool) -> int:
 
     That is damping, friction, sleep, the cap of velocities and the motors that hold joints.
     """
+    within = {"physicsClientId": client}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.urdf"
         path.write_text(text, "utf-8")
-        flags = bullet.URDF_USE_INERTIA_FROM_FILE
-        robot: int = bullet.loadURDF(
-            str(path), useFixedBase=fixed, flags=flags, physicsClientId=client
-        )
-    count = bullet.getNumJoints(robot, physicsClientId=client)
+        how = {"useFixedBase": fixed, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
+        robot: int = bullet.loadURDF(str(path), **how, **within)
+    lossy = "linearDamping", "angularDamping", "jointDamping", "lateralFriction"
+    bare = {**dict.fromkeys(lossy, 0.0), "maxJointVelocity": NO_CAP}
+    bare["activationState"] = bullet.ACTIVATION_STATE_DISABLE_SLEEPING
+    count = bullet.getNumJoints(robot, **within)
     for link in range(-1, count):
-        bullet.changeDynamics(
-            robot,
-            link,
-            linearDamping=0.0,
-            angularDamping=0.0,
-            jointDamping=0.0,
-            lateralFriction=0.0,
-            maxJointVelocity=NO_CAP,
-            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-            physicsClientId=client,
-        )
-    bullet.setJointMotorControlArray(
-        robot,
-        list(range(count)),
-        bullet.VELOCITY_CONTROL,
-        forces=[0.0] * count,
-        physicsClientId=client,
-    )
+        bullet.changeDynamics(robot, link, **bare, **within)
+    motors, off = (robot, list(range(count))), [0.0] * count
+    bullet.setJointMotorControlArray(*motors, bullet.VELOCITY_CONTROL, forces=off, **within)
     return robot
 
 

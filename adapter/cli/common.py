@@ -11,7 +11,7 @@ from typing import Any
 from adapter.cli.names import effects_named
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot
-from adapter.learning.known_effects import learnable, not_taken_off
+from adapter.learning.known_effects import as_told, learnable, not_learned
 from adapter.model.self_model import SelfModel
 from adapter.runs.config import Config, config_recorded, config_table, read_config
 from adapter.runs.terminal import program_version, warn
@@ -64,11 +64,11 @@ def configure(
     learner = config.pipeline.learner
     changes: dict[str, Any] = {}
     if args.effects is not None:
-        changes["effects"] = effects_named(args.effects)
+        changes["effects"] = as_told(robot, effects_named(args.effects))
     else:
         unsaid = not learner.effects and not as_recorded
         changes["effects"] = learnable(robot, REAL_ARM_EFFECTS if unsaid else learner.effects)
-    warn([f"{robot.name}: the learner leaves out {name}" for name in not_taken_off(robot)])
+    warn([f"{robot.name}: {said}" for said in not_learned(robot, changes["effects"])])
     if args.mode is not None:
         changes["mode"] = args.mode
     if args.seed is not None:

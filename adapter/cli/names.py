@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.effects import LEARNED
-from adapter.effects.catalogue import LEARNABLE, REAL_ARM_EFFECTS
+from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
 from adapter.effects.kept import read_kept
 from adapter.effects.law import LAW
 from adapter.errors import SettingsError
 from adapter.runs.config import read_config
-from drivers.errors import choices
 from drivers.faults.spec import Faults
 from sim.options import DEFAULT_SCENARIO, options_of
 from sim.options import check as check_scenario
@@ -40,17 +38,17 @@ def effects_named(text: str) -> tuple[str, ...]:
     for name in (name.strip() for name in text.split(",") if name.strip()):
         if name.endswith(".toml"):
             for law in read_kept(Path(name)):
-                if law.in_files not in LEARNABLE:
+                own = law.learned_from(law.values)
+                if not own:
                     raise SettingsError(
-                        f"{name}: [{law.name}] is c {law.in_files.removeprefix(LAW)}: its size is "
-                        "not learned online; a model that has it, from adapter gap, keeps it as it "
-                        "is"
+                        f"{name}: [{law.name}] is c {law.in_files.removeprefix(LAW)}: what follows "
+                        "the load is not learned online; a model that has it, from adapter gap, "
+                        "keeps it as it is"
                     )
-                names[law.in_files] = None
-            continue
-        if name != "real" and name not in LEARNABLE:
-            raise SettingsError(f"no effect '{name}'; {choices(name, ('none', 'real', *LEARNED))}")
-        names.update(dict.fromkeys(REAL_ARM_EFFECTS if name == "real" else [name]))
+                names |= dict.fromkeys(own)
+        else:
+            known = effects_by_name(REAL_ARM_EFFECTS if name == "real" else (name,))
+            names |= dict.fromkeys(effect.name for effect in known)
     return tuple(names)
 
 

@@ -69,7 +69,7 @@ def not_learned(documented: SelfModel, effect_names: Sequence[str]) -> list[Acti
     """Lasting effects of a documented model but for its bodies and for those that are learned."""
     whole = with_bodies(documented)
     lasting = lasting_effects(whole.effects, whole.tree.n)
-    return [active for active in lasting if active.effect.name not in effect_names]
+    return [active for active in lasting if not active.starts(effect_names)]
 
 
 class ModelFeedforward(Feedforward):
@@ -239,17 +239,10 @@ class ModelFeedforward(Feedforward):
 
 def _shares_of_effect(effect: LearnedEffect) -> Array | None:
     """(COLUMNS, K) of each part of a learned effect, by its unit; None where of none."""
-    shares = []
-    for k in range(len(effect.basis(JointSignals(*np.zeros((3, 1)))))):
-
-        def part(at: JointSignals, k: int = k) -> Array:
-            return effect.basis(at)[k]
-
-        found = shares_of(part, 1)
-        if found is None:
-            return None
-        shares.append(found)
-    return np.hstack(shares)
+    parts = range(0 if effect.by else len(effect.shapes) or 1)
+    found = [shares_of(lambda at, k=k: effect.basis(at)[k], 1) for k in parts]  # type: ignore[misc]
+    shares = [x for x in found if x is not None]
+    return np.hstack(shares) if shares and len(shares) == len(found) else None
 
 
 def _split(known: Sequence[Active], n: int) -> tuple[ByJoint | None, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,18 @@ class Active:
     def lasting(self) -> bool:
         """Whether it has no end: it is there in whatever comes after the recording."""
         return self.interval_s[1] == np.inf
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Of a model file, as if it acted always."""
+        joints = {"joints": [self.joint + 1]} if self.joint >= 0 else {}
+        return {"effect": self.effect.name, "parameters": dict(self.values), **joints}
+
+    def starts(self, names: Container[str] | None = None) -> dict[str, float]:
+        """Where parameters of learned effects start, by name, if it is learned with these."""
+        parts = self.effect.learned_from(self.values)
+        parts = {x: value for k, (x, value) in enumerate(parts.items()) if value or k == 0}
+        return parts if names is None or all(name in names for name in parts) else {}
 
     @property
     def shown(self) -> bool:

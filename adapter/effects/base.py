@@ -159,12 +159,9 @@ class Motion:
 
     def moved(self, joint: int, q: Array, dq: Array, ddq: Array) -> Motion:
         """The same with the joint (from 0) displaced by q, dq, ddq (m,)."""
-        changed = {}
-        for name, extra in (("q", q), ("dq", dq), ("ddq", ddq)):
-            table = getattr(self, name).copy()
-            table[:, joint] += extra
-            changed[name] = table
-        return replace(self, **changed)
+        pairs = (self.q, q), (self.dq, dq), (self.ddq, ddq)
+        q, dq, ddq = (own + on_joint(self, joint, extra) for own, extra in pairs)
+        return replace(self, q=q, dq=dq, ddq=ddq)
 
     def inside_band(self, x: Array, joint: int) -> Array:
         """Torque x (m,) of a joint without what lies above its band: further rates are noise."""
@@ -322,6 +319,8 @@ class Effect(ABC):
         bundled: whether any joint may have it: such effects of one joint hide one another.
         over_angle: whether it is a curve over the joint's angle.
         is_theta: whether its coefficients are the ten inertial parameters of a link.
+        by: joint (from 1) by whose signals another has it; 0 by its own.
+        instant: which table of `ByJoint` shows it at one instant, and what of it; None for none.
     """
 
     name: ClassVar[str]
@@ -348,6 +347,8 @@ class Effect(ABC):
     bundled: ClassVar[bool] = False
     over_angle: ClassVar[bool] = False
     is_theta: ClassVar[bool] = False
+    by: int = 0
+    instant: ClassVar[tuple[str, Callable[[Values], Any]] | None] = None
 
     @property
     def log_odds_of_start(self) -> float:
@@ -393,12 +394,19 @@ class Effect(ABC):
         """The same where the joint turned by so many rad, of what cannot be told from it."""
         return 0.0
 
+    def learned_from(self, values: Values) -> dict[str, float]:
+        """Which effects' learned parameters, its own first, start from what a model tells of it."""
+        return {}
+
     def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """Add what one instant shows of the effect to sums; False where it shows nothing.
 
         `joint` from 0, or all of them.
         """
-        return False
+        if self.instant is not None:
+            table, share = self.instant
+            getattr(sums, table)[joint] += share(values)
+        return self.instant is not None
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Put itself into what a simulator's file holds (joint from 0, -1 without one).
@@ -501,21 +509,31 @@ def on_joint(motion: Motion, joint: int, torque: Array) -> Array:
 
 
 class JointTorque(TorqueEffect):
-    """A torque effect that each joint has for itself, by its own signals and numbers alone."""
+    """A torque effect that each joint has for itself, by one joint's signals and numbers alone.
+
+    Attributes:
+        variables: signals that it follows by no line.
+    """
+
+    variables: frozenset[str] = frozenset()
 
     @abstractmethod
     def law(self, at: JointSignals, values: Values) -> Array:
-        """Torque, N m, of the signals' shape; parameters are numbers or arrays that fit it.
+        """Torque, N m, of the shape of signals, `by` whichever; parameters are as many, or numbers.
 
         What jumps must be as smooth as `JointSignals.direction`.
         """
 
+    def on(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """The law (m,) on one joint."""
+        k = self.by - 1 if self.by else joint
+        q, dq, ddq, own = (x[:, k] for x in (motion.q, motion.dq, motion.ddq, tau))
+        numbers = {key: x if np.ndim(x) else float(x) for key, x in values.items()}
+        return self.law(JointSignals(q, dq, ddq, own, drum=float(motion.drums[k])), numbers)
+
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The law on one joint."""
-        q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
-        numbers = {key: x if np.ndim(x) else float(x) for key, x in values.items()}
-        at = JointSignals(q, dq, ddq, own, drum=float(motion.drums[joint]))
-        return on_joint(motion, joint, self.law(at, numbers))
+        return on_joint(motion, joint, self.on(motion, tau, joint, values))
 
     def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The law itself."""
@@ -586,8 +604,8 @@ class LearnedEffect(Effect):
         return np.asarray(sum(share * column for share, column in parts))
 
     def learned_from(self, values: Values) -> dict[str, float]:
-        """Which effects' learned parameters, by name, start from what a model tells of this one."""
-        return {self.name: float(values[self.key])}
+        """Its own parameter, but of what follows the load: the learner knows no rigid torque."""
+        return {} if getattr(self, "by_load", False) else {self.name: float(values[self.key])}
 
     def learned_as(self, value: float, shape: float) -> tuple[str, dict[str, float]]:
         """Name and all parameters of what was learned."""
@@ -611,9 +629,7 @@ class LinearEffect(LearnedEffect, JointTorque):
         """The one column."""
         return (self.column(at),)
 
-    def columns(self, at: JointSignals) -> tuple[Array, ...]:
-        """The one column."""
-        return (self.column(at),)
+    columns = basis
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Parameter times column."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from adapter.effects import base as base
 from adapter.effects.base import Array, Motion, Values
-from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import ALONE, BARE, LEVELLED, LOADS, WEIGHED, Length, Phrase
 from adapter.model.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
 from adapter.model.spatial import exp_rotation
@@ -140,6 +139,10 @@ class BaseTilt(base.BodyEffect):
 KEYS = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
+def _wrench(values: Values) -> Array:
+    return np.array([values[key] for key in KEYS], dtype=float)
+
+
 class ExternalWrench(base.TorqueEffect):
     """A constant wrench w that pushes the flange for a time: tau_measured = tau_rigid - J^T w.
 
@@ -160,13 +163,8 @@ class ExternalWrench(base.TorqueEffect):
     sudden = True
     passing = True
     watched = True
+    instant = "wrench", _wrench
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """-J^T w."""
-        wrench = np.array([values[key] for key in KEYS], dtype=float)
-        return -motion.arm.wrench_torque(motion.q, wrench)
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """The wrench."""
-        sums.wrench += np.array([values[key] for key in KEYS], dtype=float)
-        return True
+        return -motion.arm.wrench_torque(motion.q, _wrench(values))

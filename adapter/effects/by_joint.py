@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.spatial import Array
 
+JointLaw = Any  # an `effects.base.JointTorque`, which is made of what is here
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 # m: a joint that slides is taken to have what one that turns a drum of this radius has
 DRUM_M = 0.1
@@ -84,15 +85,12 @@ class JointSignals(NamedTuple):
         """sign(dq), as smooth as the signals are."""
         return smooth_sign(self.dq, self.ddq, self.smoothing_s, self.drum)
 
-
-class JointLaw(Protocol):
-    """A torque that a joint has by its own signals; see `effects.base.JointTorque`."""
-
-    by_load: ClassVar[bool]
-
-    def law(self, at: JointSignals, values: Mapping[str, Any]) -> Array: ...
-
-    def absent(self, n: int) -> dict[str, Array]: ...
+    def of(self, joint: int) -> JointSignals:
+        """Those of one joint (from 1) for all of (..., n); where 0, of each its own."""
+        if not joint:
+            return self
+        q, dq, ddq, tau = (x[..., joint - 1 : joint] if np.ndim(x) else x for x in self[:4])
+        return self._replace(q=q, dq=dq, ddq=ddq, tau=tau)
 
 
 @dataclass(eq=False)
@@ -173,4 +171,4 @@ class ByJoint:
 
     def torque(self, at: JointSignals) -> Array | float:
         """Sum of the laws (..., n) for signals of that shape; the wrench is not in it."""
-        return sum((effect.law(at, values) for effect, values in self.laws), 0.0)
+        return sum((effect.law(at.of(effect.by), values) for effect, values in self.laws), 0.0)

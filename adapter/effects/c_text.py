@@ -19,7 +19,6 @@ from adapter.effects.active import Active, lasting_effects, with_bodies
 from adapter.effects.base import BodyEffect, JointTorque
 from adapter.effects.bristle_friction import Rubs
 from adapter.effects.by_joint import DRUM_M, JointSignals
-from adapter.effects.law import OverSignals
 from adapter.effects.robots import RobotText, in_words, kept_lines
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel, theta_doubt
@@ -144,9 +143,8 @@ def _plain(kernel: Any) -> Callable[..., Any]:
         empty=lambda shape: np.empty(shape, dtype=object),
         zeros=lambda shape: np.full(shape, 0.0, dtype=object),
     )
-    return FunctionType(
-        function.__code__, {**function.__globals__, **own, "math": np, "np": arrays}
-    )
+    names = {**function.__globals__, **own, "math": np, "np": arrays}
+    return FunctionType(function.__code__, names)
 
 
 def c_text(model: SelfModel, onto: None = None, alone: bool = True) -> RobotText:
@@ -230,15 +228,11 @@ class _Laws:
 
     def _torque(self, active: Active) -> Traced | float:
         """A law of one joint. Raises TypeError where it is none that C can hold."""
-        effect, own = active.effect, self._joints[active.joint]
+        effect = active.effect
+        own = self._joints[effect.by - 1 if effect.by else active.joint]
         values = {key: x if np.ndim(x) else float(x) for key, x in active.values.items()}
         if not isinstance(effect, JointTorque):
             raise TypeError(effect.name)
-        if isinstance(effect, OverSignals):  # of its own joint or another
-            followed = self._joints[effect.by - 1 if effect.by else active.joint]
-            return _number(
-                np.asarray(effect.on_signals(followed._replace(drum=1.0), values), object)
-            )
         if not isinstance(effect, Rubs):
             return _number(np.asarray(effect.law(own, values), object))
         s0, z = effect.bristles(values), _number(own.direction)

@@ -12,7 +12,7 @@ from adapter.effects.base import Effect, LearnedEffect
 from adapter.effects.bodies import BaseTilt, ExternalWrench, LinkInertia, Payload
 from adapter.effects.bristle_friction import BristleFriction, StribeckFriction
 from adapter.effects.encoders import Backlash, EncoderOffset, EncoderRipple, JointElasticity
-from adapter.effects.law import CURVES, LAWS
+from adapter.effects.law import CURVES, LAWS, learned_law
 from adapter.effects.sensors import SignalDelay, TorqueFilter, TorqueGain, TorqueOffset
 from adapter.errors import SettingsError
 from drivers.errors import choices
@@ -58,11 +58,6 @@ LEARNED: dict[str, LearnedEffect] = {
     name: effect for name, effect in CATALOGUE.items() if learnable(effect)
 }
 
-# With laws that need no name to be learned.
-LEARNABLE: Mapping[str, LearnedEffect] = ChainMap(
-    LEARNED, {name: law for name, law in LAWS.items() if learnable(law)}
-)
-
 # What a real arm's joints have, as far as anybody knows before it has moved. Those that the data
 # do not show fade.
 REAL_ARM_EFFECTS = (
@@ -94,10 +89,14 @@ def registered(effect: Effect) -> Iterator[Effect]:
         LEARNED.pop(effect.name, None)
 
 
+def learned_effect(name: str) -> LearnedEffect:
+    """The learner's effect of a name, a law among them. Raises SettingsError with the choices."""
+    effect = LEARNED.get(name) or learned_law(name)
+    if effect is None:
+        raise SettingsError(f"no effect '{name}'; {choices(name, ('none', 'real', *LEARNED))}")
+    return effect
+
+
 def effects_by_name(names: Iterable[str]) -> tuple[LearnedEffect, ...]:
     """The learner's effects of these names, in order. Raises SettingsError with the choices."""
-    chosen = list(names)
-    for name in chosen:
-        if name not in LEARNABLE:
-            raise SettingsError(f"no effect '{name}'; {choices(name, LEARNED)}")
-    return tuple(LEARNABLE[name] for name in chosen)
+    return tuple(map(learned_effect, names))

@@ -9,7 +9,7 @@ import numpy as np
 
 from adapter.effects import base as base
 from adapter.effects.base import Array, Motion, Values
-from adapter.effects.by_joint import ByJoint, smooth_sign
+from adapter.effects.by_joint import smooth_sign
 from adapter.effects.phrases import FLANK, LOADS, TURN, Phrase
 from adapter.model.urdf_text import Additions
 
@@ -22,17 +22,13 @@ class EncoderOffset(base.MotionEffect):
     parameters = (base.Parameter("o", "rad"),)
     prior_std = 0.012
     phrase = Phrase.reads("o", "encoder")
+    instant = "offset", lambda values: values["o"]
     shows = ((LOADS, "grows with the load"),)
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - o."""
         still = np.zeros(len(motion.t))
         return motion.moved(joint, still - float(values["o"]), still, still)
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """The offset."""
-        sums.offset[joint] += float(values["o"])
-        return True
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """The zero of the joint."""
@@ -53,6 +49,7 @@ class EncoderRipple(base.MotionEffect):
     log_odds = -2.0
     inexact = 0.02
     phrase = Phrase("the encoder of {who} errs by {a} once per turn")
+    instant = "wave", lambda values: values["a"] * np.exp(1j * values["phase"])
     shows = ((LOADS, "grows with the load"), (TURN, "changes sign along the turn"))
 
     def decode(self, x: Array) -> dict[str, Any]:
@@ -65,11 +62,6 @@ class EncoderRipple(base.MotionEffect):
         dq, ddq = motion.dq[:, joint], motion.ddq[:, joint]
         sine, cosine = a * np.sin(angle), a * np.cos(angle)
         return motion.moved(joint, -sine, -cosine * dq, sine * dq**2 - cosine * ddq)
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """The wave."""
-        sums.wave[joint] += float(values["a"]) * np.exp(1j * float(values["phase"]))
-        return True
 
 
 class JointElasticity(base.MotionEffect):
@@ -86,6 +78,7 @@ class JointElasticity(base.MotionEffect):
     positive = ("k",)
     inexact = 0.05
     phrase = Phrase("{who} {is} elastic, with a stiffness of {k}")
+    instant = "compliance", lambda values: 1.0 / values["k"]
     shows = ((LOADS, "grows with the square of the load"),)
 
     def decode(self, x: Array) -> dict[str, Any]:
@@ -97,11 +90,6 @@ class JointElasticity(base.MotionEffect):
         twist = -motion.inside_band(tau[:, joint], joint) / float(values["k"])
         speed = motion.rate(twist)
         return motion.moved(joint, twist, speed, motion.rate(speed))
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """The compliance."""
-        sums.compliance[joint] += 1.0 / float(values["k"])
-        return True
 
 
 MOVES = 0.9  # of the smoothed direction, from which a joint is on its way
@@ -134,6 +122,7 @@ class Backlash(base.MotionEffect):
     log_odds = -1.0
     inexact = 0.1
     phrase = Phrase("{who} {has} {b} of backlash")
+    instant = "half_play", lambda values: 0.5 * values["b"]
     shows = ((FLANK, "is gone under that load"),)
 
     def templates(self) -> tuple[base.Template, ...]:
@@ -164,8 +153,3 @@ class Backlash(base.MotionEffect):
     def log_odds_of(self, values: Values) -> float:
         """What starts and stops leave of the noise in accelerations looks like a narrow play."""
         return NARROW if abs(float(values["b"])) < SIZES_RAD[0] else 0.0
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """Half the play."""
-        sums.half_play[joint] += 0.5 * float(values["b"])
-        return True

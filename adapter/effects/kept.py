@@ -33,13 +33,13 @@ class KeptLaw(Law):
         super().__init__(law.expression, law.by)
         self.in_files = law.name  # type: ignore[misc]
         self.name, self.title, self.log_odds = name, title, 0.0  # type: ignore[misc]
-        self._values = values
+        self.values = {p.key: float(values.get(p.key, 0.0)) for p in self.parameters}
 
     def templates(self) -> tuple[Template, ...]:
         """At the setting that it was kept with."""
         setting = self.expression.setting
-        template = self.at(float(self._values[setting.key]) if setting else 1.0)
-        std = abs(float(self._values["c"])) or 1.0
+        template = self.at(self.values[setting.key] if setting else 1.0)
+        std = abs(self.values["c"]) or 1.0
         return (replace(template, prior_std=(std,) * len(template.prior_std)),)
 
     def reshaped(self, values: Values, ratio: float) -> tuple[Template, ...]:

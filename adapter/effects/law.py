@@ -7,19 +7,19 @@ expression is its name, so that a file that holds it can be read by whoever has 
 from __future__ import annotations
 
 import re
-from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from adapter.effects import base as base
-from adapter.effects.base import Array, JointSignals, Motion, Values
+from adapter.effects.base import Array, JointSignals, Values
 from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
 
-LAW = "law: "  # begins the name of a law that has no other
+LAW, AT = "law: ", " at "  # begins the name of a law that has no other; goes before its setting
 LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting
 CURVE_NM = 0.3  # of a curve's coefficients, and of a law's torque
 EDGES = tuple(np.linspace(0.05, 0.95, 19))  # shares of a range in which something begins
@@ -162,14 +162,7 @@ def _over_angle(
 
 
 class OverSignals(base.JointTorque):
-    """A torque of no catalogue, by signals of one joint.
-
-    Attributes:
-        by: that joint, from 1; 0 for its own. variables: the signals that it follows.
-    """
-
-    by = 0
-    variables: frozenset[str]
+    """A torque of no catalogue, by signals of one joint, which `variables` names."""
 
     @property
     def along(self) -> str:
@@ -179,11 +172,7 @@ class OverSignals(base.JointTorque):
     def curve(self, x: Array, values: Values) -> Array:
         """Torque (k,) over that signal; of what is a kind of friction, at 1 rad/s."""
         q, dq, ddq, tau = (x if key == self.along else np.ones_like(x) for key in SIGNALS)
-        return self.on_signals(JointSignals(q, dq, ddq, tau), values)
-
-    @abstractmethod
-    def on_signals(self, at: JointSignals, values: Values) -> Array:
-        """Torque by signals of the joint that it follows."""
+        return self.law(JointSignals(q, dq, ddq, tau), values)
 
 
 class Law(OverSignals):
@@ -249,25 +238,12 @@ class Law(OverSignals):
             linear=False,
         )
 
+    def learned_from(self, values: Values) -> dict[str, float]:
+        """c, of the law at its setting, if it is learned."""
+        return {} if self.by_load else {_at(self, values): float(values["c"])}
+
     def law(self, at: JointSignals, values: Values) -> Array:
-        """c times the expression of signals (..., n) of all joints, or of one that has its own."""
-        if self.by:
-            k = slice(self.by - 1, self.by)
-            tau = at.tau[..., k] if self.by_load else at.tau
-            at = at._replace(q=at.q[..., k], dq=at.dq[..., k], ddq=at.ddq[..., k], tau=tau)
-        return self.on_signals(at, values)
-
-    def on(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """Torque (m,) of one joint, by its own signals or another's."""
-        k = self.by - 1 if self.by else joint
-        at = JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
-        return self.on_signals(at, values)
-
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """The law on one joint."""
-        return base.on_joint(motion, joint, self.on(motion, tau, joint, values))
-
-    def on_signals(self, at: JointSignals, values: Values) -> Array:
+        """c times the expression."""
         setting = self.expression.setting
         term = self.expression.term(at, np.asarray(values[setting.key] if setting else 0.0))
         if setting and setting.wave:
@@ -276,20 +252,45 @@ class Law(OverSignals):
 
 
 class LearnedLaw(base.LearnedEffect, Law):
-    """A law without a setting, by the joint's own motion: it can be learned on beside θ."""
+    """A law at a setting, if it has one, which is in its name: c can be learned beside θ.
+
+    Args:
+        law: which; held: the parameters behind c.
+    """
 
     prior_std, step = 10.0, 1.0  # of powers of some tenths of a rad/s
 
+    def __init__(self, law: Law, held: Values) -> None:
+        super().__init__(law.expression, law.by)
+        self.name, self._law, self._held = _at(law, held), law.name, held  # type: ignore[misc]
+        said = " and ".join(f"{key} = {x:.3g}" for key, x in held.items())
+        self.title = f"{law.title}{AT if said else ''}{said}"  # type: ignore[misc]
+
     def basis(self, at: JointSignals) -> tuple[Array, ...]:
-        """The expression."""
-        return (np.asarray(self.expression.term(at, np.zeros(1))),)
+        """The expression; the joint that others follow is not its own follower."""
+        own = np.arange(np.shape(at.dq)[-1]) == self.by - 1
+        return (np.where(own, 0.0, self.law(at.of(self.by), {"c": 1.0, **self._held})),)
+
+    def learned_as(self, value: float, shape: float) -> tuple[str, dict[str, float]]:
+        """The law with its setting."""
+        return self._law, {"c": value, **self._held}
 
 
-def _laws_of(expression: Expression) -> list[Law]:
-    if BY in expression.text:
-        return [Law(expression, by) for by in range(1, MOST_JOINTS + 1)]
-    alone = expression.setting is None and "tau" not in expression.powers
-    return [LearnedLaw(expression) if alone else Law(expression)]
+def _at(law: Law, values: Values) -> str:
+    """The name under which a law is learned: its setting does not change, and is in it."""
+    said = [f"{p.key} = {float(values[p.key])!r}" for p in law.parameters[1:]]
+    return law.in_files + AT * bool(said) + " and ".join(said)
+
+
+@lru_cache
+def learned_law(name: str) -> LearnedLaw | None:
+    """The law of that name, as it is learned; None where there is none."""
+    text, _, said = name.partition(AT)
+    numbers = re.findall(r"(\w+) = (-?\d+(?:\.\d+)?(?:e-?\d+)?)", said)
+    law, held = LAWS.get(text), {key: float(value) for key, value in numbers}
+    if law is None or law.by_load or list(held) != [p.key for p in law.parameters[1:]]:
+        return None
+    return LearnedLaw(law, held)
 
 
 PIECES, DEGREE = 5, 3  # of a spline over a signal's range
@@ -300,14 +301,14 @@ WEIGHTS: dict[str, Callable[[JointSignals], Array | float]] = {
 }
 
 
-def splines(x: Array, low: Array | float, high: Array | float, pieces: int = PIECES) -> Array:
-    """Cubic B-splines (pieces + DEGREE, ...) over a range; beyond it they stay as at its end."""
+def splines(x: Array, low: Array | float, high: Array | float, pieces: int = PIECES) -> list[Array]:
+    """Cubic B-splines (pieces + DEGREE of them) over a range; beyond it they stay as at its end."""
     step = np.maximum(np.subtract(high, low), 1e-9) / pieces
-    at = np.clip((x - low) / step, 0.0, pieces) + DEGREE
-    knots = np.arange(pieces + DEGREE).reshape(-1, *[1] * np.ndim(at))
-    away = np.abs(at - knots - 2.0)
-    inside = 4.0 - 3.0 * (2.0 - away) * away**2
-    return np.where(away < 1.0, inside, np.maximum(2.0 - away, 0.0) ** 3) / 6.0
+    at = np.minimum(np.maximum((x - low) / step, 0.0), pieces) + 1.0
+    away = [np.abs(at - k) for k in range(pieces + DEGREE)]
+    return [
+        (np.maximum(2.0 - u, 0.0) ** 3 - 4.0 * np.maximum(1.0 - u, 0.0) ** 3) / 6.0 for u in away
+    ]
 
 
 class Curve(OverSignals):
@@ -347,18 +348,18 @@ class Curve(OverSignals):
         return (self.between(-1.0, 1.0),)
 
     def law(self, at: JointSignals, values: Values) -> Array:
-        """By each joint's own signals."""
-        return self.on_signals(at, values)
-
-    def on_signals(self, at: JointSignals, values: Values) -> Array:
         """Splines times coefficients, (..., n) of all joints or of one."""
         basis = splines(getattr(at, self.signal), values["low"], values["high"])
-        x = np.moveaxis(np.asarray(values["x"], dtype=float), -1, 0)
-        x = x.reshape(len(x), *[1] * (basis.ndim - x.ndim), *x.shape[1:])
-        return np.asarray(WEIGHTS[self.weight](at) * np.sum(basis * x, axis=0))
+        shares = np.moveaxis(np.asarray(values["x"], dtype=float), -1, 0)
+        torque = sum(share * one for share, one in zip(shares, basis, strict=True))
+        return np.asarray(WEIGHTS[self.weight](at) * torque)
 
 
 OVER_Q = Curve("q", "sign(dq) "), Curve("q", "dq ")
 CURVES: dict[str, Curve] = {curve.name: curve for curve in (*map(Curve, SIGNALS), *OVER_Q)}
-LAWS: dict[str, Law] = {law.name: law for x in _grammar() for law in _laws_of(x)}
+LAWS: dict[str, Law] = {
+    law.name: law
+    for x in _grammar()
+    for law in (Law(x, by) for by in (range(1, MOST_JOINTS + 1) if BY in x.text else (0,)))
+}
 EXPRESSIONS = tuple(dict.fromkeys(law.expression.text for law in LAWS.values()))

@@ -8,7 +8,7 @@ import numpy as np
 
 from adapter.effects import base as base
 from adapter.effects.base import Array, Motion, Values
-from adapter.effects.by_joint import ByJoint, JointSignals
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.phrases import KNOWN_WEIGHT, LOADS, SPEEDS, STILL, SWINGS, Phrase
 
 LATEST_S = 0.012  # a bus, a filter and a hold together are faster
@@ -49,6 +49,7 @@ class TorqueGain(base.SensorEffect):
     parameters = (base.Parameter("g", "1", lower=-0.95),)
     prior_std = 0.05
     phrase = Phrase.reads("g", "torque sensor")
+    instant = "log_gain", lambda values: np.log1p(values["g"])
     shows = ((LOADS, "grows with the load"), (KNOWN_WEIGHT, "misreads it in proportion"))
     watched = True
 
@@ -61,11 +62,6 @@ class TorqueGain(base.SensorEffect):
         out = tau.copy()
         out[:, joint] *= 1.0 + float(values["g"])
         return out
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """The gain."""
-        sums.log_gain[joint] += np.log1p(float(values["g"]))
-        return True
 
 
 LATENESS = (
@@ -88,6 +84,7 @@ class SignalDelay(base.SensorEffect):
     prior_std = 3e-3
     inexact = 0.02
     form = base.LATE
+    instant = "delay_s", lambda values: values["d"]
     phrase = Phrase(
         "the torque of {who} comes {x} after the position",
         "d",
@@ -108,16 +105,9 @@ class SignalDelay(base.SensorEffect):
         if whole:
             before = np.column_stack([np.interp(motion.t - whole, motion.t, x) for x in tau.T])
         late = before - (d - whole) * motion.rate(before)
-        if joint < 0:
-            return np.asarray(late)
-        out = tau.copy()
-        out[:, joint] = late[:, joint]
+        out, own = tau.copy(), slice(None) if joint < 0 else joint
+        out[:, own] = late[:, own]
         return np.asarray(out)
-
-    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
-        """The delay."""
-        sums.delay_s[joint] += float(values["d"])
-        return True
 
 
 class TorqueFilter(base.LearnedEffect, base.SensorEffect):

@@ -319,7 +319,7 @@ def _free(curve: Curve, k: int) -> Pattern:
     def basis(motion: Motion, tau: Array, joint: int) -> Array:
         x = signal_of(curve.signal, motion, tau, joint)
         weight = WEIGHTS[curve.weight](JointSignals(x, motion.dq[:, joint], x))
-        return np.asarray((weight * splines(x, float(x.min()), float(x.max()))).T)
+        return np.asarray((weight * np.array(splines(x, float(x.min()), float(x.max())))).T)
 
     depends_on = (f"{curve.signal}{k}", *([f"dq{k}"] if curve.weight else []))
     return Pattern(f"{curve.name} {k}", depends_on, basis, PIECES + DEGREE, curve)
@@ -415,7 +415,7 @@ def signal_of(name: str, motion: Motion, tau: Array, joint: int) -> Array:
 def _over_time(motion: Motion, tau: Array, joint: int) -> Array:
     """Splines (m, SLOW_PIECES + 3) of time."""
     t = motion.t
-    return splines(t, float(t[0]), float(t[-1]), SLOW_PIECES).T
+    return np.array(splines(t, float(t[0]), float(t[-1]), SLOW_PIECES)).T
 
 
 def simpler_wins(simple: tuple[Candidate, float], other: tuple[Candidate, float]) -> bool:

@@ -12,13 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.catalogue import LEARNABLE, effects_by_name
+from adapter.effects.catalogue import LEARNED, effects_by_name
+from adapter.effects.law import AT, LearnedLaw, OverSignals
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import JointMotion, jit
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns, stamps_of
+
+NOT_THERE = 1e-6  # of its usual size: a law with less doubt is one that a joint has not
 
 
 @jit
@@ -70,42 +73,51 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
 def learnable(model: SelfModel, names: Sequence[str]) -> tuple[str, ...]:
     """Effects to learn: these, and after them what the model has that can be learned further."""
     lasting = lasting_effects(model.effects, model.tree.n)
-    told = {name for active in lasting for name in starts_from(active, tuple(LEARNABLE))}
-    return (*names, *(name for name in LEARNABLE if name in told and name not in names))
+    told = dict.fromkeys(name for x in lasting for name in x.starts())
+    return tuple(dict.fromkeys([*names, *(x for x in LEARNED if x in told), *told]))
 
 
-def starts_from(active: Active, names: Sequence[str]) -> dict[str, float]:
-    """Which of the learned effects, by name, start from what of an effect of a model; or none."""
-    if active.effect.name not in names:
-        return {}
-    parts = LEARNABLE[active.effect.name].learned_from(active.values)
-    parts = {name: value for name, value in parts.items() if value or name == active.effect.name}
-    return parts if set(parts) <= set(names) else {}
+def as_told(model: SelfModel, names: Sequence[str]) -> tuple[str, ...]:
+    """These names; a law that the model has is learned at the setting that it has there."""
+    own, found = learnable(model, ()), dict[str, None]()
+    for name in names:
+        same = [x for x in own if x.partition(AT)[0] == name.partition(AT)[0]]
+        found |= dict.fromkeys(same or [name])
+    return tuple(found)
 
 
-def not_taken_off(model: SelfModel) -> tuple[str, ...]:
-    """Names of the model's lasting effects that the learner neither learns nor takes off."""
+def not_learned(model: SelfModel, names: Sequence[str]) -> list[str]:
+    """What is said of lasting effects that the learner leaves out, and of laws that it holds."""
     whole = with_bodies(model)
-    return by_joint(lasting_effects(whole.effects, whole.tree.n), whole.tree.n).left_out
+    lasting = lasting_effects(whole.effects, whole.tree.n)
+    said = [f"the learner leaves out {x}" for x in by_joint(lasting, whole.tree.n).left_out]
+    laws = [x for x in lasting if isinstance(x.effect, OverSignals) and not x.starts(names)]
+    held = "stays as it is: it is not learned online"
+    return said + [f"joint {x.joint + 1}: {x.effect.title}, {held}" for x in laws]
 
 
 def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Array, Array] | None:
     """(e, n) values and standard deviations that a model gives of learned effects, else None.
 
-    NaN where it has no such effect on a joint. Without a standard deviation in the model it is
-    the effect's own prior one.
+    NaN where it has no such effect on a joint; a law is held to be on no other joints than the
+    model's. Without a standard deviation in the model it is the effect's own prior one.
     """
     effects = effects_by_name(names)
     total, variance = np.zeros((len(effects), n)), np.full((len(effects), n), np.nan)
     for active in known:
-        for name, value in starts_from(active, names).items():
-            effect, at = LEARNABLE[name], (names.index(name), active.joint)
-            std = active.std.get(effect.key) if effect is active.effect else None
+        for k, (name, value) in enumerate(active.starts(names).items()):
+            at = names.index(name), active.joint
+            effect = effects[at[0]]
+            std = active.std.get(effect.key) if k == 0 else None
             widest = effect.learned_std
             known_to = None if std is None or not np.isfinite(std) else float(std)
             spread = widest if known_to is None else max(known_to, 1e-3 * widest)  # not surer
             total[at] += value
             variance[at] = np.nan_to_num(variance[at]) + spread**2
+    for k, effect in enumerate(effects):
+        if isinstance(effect, LearnedLaw) and np.isfinite(variance[k]).any():
+            nowhere = np.isnan(variance[k])
+            variance[k, nowhere] = (0.5 * NOT_THERE * effect.learned_std) ** 2
     told = np.isfinite(variance)
     return (np.where(told, total, np.nan), np.sqrt(variance)) if told.any() else None
 

@@ -16,7 +16,7 @@ from adapter.judgement.noise import memory_s
 from adapter.learning.adam import FlatAdam, same_bits
 from adapter.learning.change import ChangeDetector, explained_share, is_new
 from adapter.learning.imu_schema import ImuSchema
-from adapter.learning.known_effects import KnownEffects, starts_from
+from adapter.learning.known_effects import KnownEffects
 from adapter.learning.posterior import LearnedPosterior, learned_posterior
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import LearnerSettings, Mode
@@ -592,7 +592,7 @@ def _taken_off(
     known: KnownArm, learned: Sequence[str], smoothing_s: float, floating: bool
 ) -> KnownEffects | None:
     """What takes the known effects off that nobody learns; None where there are none."""
-    fixed = [active for active in known.effects if not starts_from(active, learned)]
+    fixed = [active for active in known.effects if not active.starts(learned)]
     if not fixed:
         return None
     names = ", ".join(dict.fromkeys(active.effect.name for active in fixed))

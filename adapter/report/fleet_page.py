@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.catalogue import KNOWN
+from adapter.effects.active import SHOWN_STD
+from adapter.effects.base import with_squares
+from adapter.effects.catalogue import effects_by_name, learned_effect
+from adapter.effects.law import LearnedLaw
 from adapter.gap.workflow import names_of
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import LEAST_STD
@@ -70,7 +73,7 @@ def _signed(value: float, std: float) -> str:
 
 def drift_words(drift: Drift) -> str:
     """A sentence."""
-    effect, per = KNOWN[drift.effect], f"per unit of {drift.follows}"
+    effect, per = learned_effect(drift.effect), f"per unit of {drift.follows}"
     unit = effect.parameters[0].written
     per = "a day" if drift.follows == TIME else per
     share = f" ({100.0 * drift.span / abs(drift.usual):.0f} % of it)" if drift.usual else ""
@@ -87,7 +90,7 @@ def standing_out_words(arm: FleetArm) -> Iterator[str]:
     """A sentence for each recording with parameters that the others do not have."""
     names, by_log = called(arm), dict[int, list[str]]()
     for x in arm.standing_out:
-        effect = KNOWN[x.effect]
+        effect = learned_effect(x.effect)
         by_log.setdefault(x.number, []).append(
             f"{effect.title.lower()} of joint {x.joint} is {x.value:.3g} "
             f"{effect.parameters[0].written} where {x.expected:.3g} was to be expected"
@@ -132,7 +135,22 @@ def summary(found: Fleet) -> list[str]:
     parts += [f"{found.read} recordings read", f"{found.known} known"]
     for number, word in ((len(found.broken), "broken"), (len(found.forgotten), "forgotten")):
         parts += [f"{number} {word}"] if number else []
-    return [", ".join(parts)]
+    return [", ".join(parts), *_law_words(found)]
+
+
+def _law_words(found: Fleet) -> Iterator[str]:
+    """A sentence for each law that some arms have on a joint and others have not."""
+    laws = effects_by_name(found.arms[0].effects) if found.arms else ()
+    for k, law in enumerate(laws):
+        for j in range(found.arms[0].model.tree.n) if isinstance(law, LearnedLaw) else ():
+            own = [
+                (x.name, x.outcome.effects[k, j], x.outcome.effects_std[k, j]) for x in found.arms
+            ]
+            has = {name: abs(c) > SHOWN_STD * std for name, c, std in own}
+            if len(set(has.values())) > 1:
+                said = [f"{x} {'has' if has[x] else 'not'} ({plus_minus(*c)})" for x, *c in own]
+                where = f"joint {j + 1} ({with_squares(law.unit)})"
+                yield f"Not all arms have a {law.title} on {where}: {', '.join(said)}"
 
 
 def as_json(found: Fleet) -> dict[str, Any]:
@@ -144,6 +162,7 @@ def as_json(found: Fleet) -> dict[str, Any]:
         "forgotten": list(found.forgotten),
         "alike": [list(pair) for pair in found.alike],
         "arms": [_arm_json(arm) for arm in found.arms],
+        "notes": summary(found)[1:],
     }
 
 
@@ -184,7 +203,7 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
         RunFolderError: the file cannot be written.
     """
     context: dict[str, Any] = {
-        "headline": summary(found)[0],
+        "lines": summary(found),
         "arms": [_arm(arm) for arm in found.arms],
         "broken": Table(("recording", "why"), list(found.broken)),
         "forgotten": found.forgotten,
@@ -206,8 +225,8 @@ def _arm(arm: FleetArm) -> dict[str, Any]:
 
 def _parameters(arm: FleetArm) -> Table:
     """What is learned of each joint and of the link that it moves; θ whole is in the model file."""
-    heads = ["joint", "mass of its link", *(KNOWN[name].title for name in arm.effects)]
-    units = ["", "kg", *(KNOWN[name].parameters[0].written for name in arm.effects)]
+    heads = ["joint", "mass of its link", *(learned_effect(name).title for name in arm.effects)]
+    units = ["", "kg", *(learned_effect(name).parameters[0].written for name in arm.effects)]
     std = arm.outcome.effects_std
     links = len(arm.model.theta) - arm.model.tree.n  # a base that floats comes first
     rows = []
@@ -239,7 +258,7 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
         legend(ax, ncols=8, fontsize=6, loc="lower center", bbox_to_anchor=(0.5, 0.98))
         drawing.figure.subplots_adjust(top=0.9)  # for the legend
         ax.set_xlabel(label)
-        effect = KNOWN[name]
+        effect = learned_effect(name)
         unit = effect.parameters[0].written
         panels.append(drawing.panel(effect.title, unit, "by joint, with standard deviations"))
     return panels

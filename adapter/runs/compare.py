@@ -292,7 +292,7 @@ def _effects(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
         std = [{k: s for a in found for k, s in a.std.items()} for found in (was, now)]
         units = (was or now)[0].effect.units()
         others = [a for key, found in tables[0].items() if key != at for a in found]
-        changed = replace(first, effects=tuple(_entry(a) for a in (*others, *now)))
+        changed = replace(first, effects=tuple(a.entry for a in (*others, *now)))
         z = []  # a number that is not there is zero
         for key, (a, b) in values.items():
             stds = (np.atleast_1d(np.asarray(s.get(key) or 0.0, dtype=float)) for s in std)
@@ -304,9 +304,3 @@ def _effects(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
 
 def _same(a: Any, b: Any) -> bool:
     return a is not None and b is not None and np.allclose(a, b, rtol=SAME, atol=0.0)
-
-
-def _entry(active: Active) -> dict[str, Any]:
-    """Of a model file."""
-    joints = {"joints": [active.joint + 1]} if active.joint >= 0 else {}
-    return {"effect": active.effect.name, "parameters": dict(active.values), **joints}

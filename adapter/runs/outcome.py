@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
+from adapter.effects.base import LearnedEffect
 from adapter.effects.catalogue import KNOWN, effects_by_name
 from adapter.errors import ModelError
 from adapter.learning.batch.theta_filling import (
@@ -18,6 +19,7 @@ from adapter.learning.batch.theta_filling import (
     told_basis,
 )
 from adapter.learning.frame_fit import Frame, nearest, profiled_weights
+from adapter.learning.known_effects import NOT_THERE
 from adapter.learning.learner import NOT_ASKED, OnlineLearner, TorqueVerdict
 from adapter.learning.posterior import Load
 from adapter.learning.settings import LearnerSettings
@@ -303,27 +305,35 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     )
 
 
+def _learned(outcome: Outcome) -> Iterator[tuple[LearnedEffect, int, int]]:
+    """Effects with their number and joint (from 0), without laws on joints that have them not."""
+    for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
+        there = outcome.effects_std[k] > NOT_THERE * effect.learned_std
+        yield from ((effect, k, int(j)) for j in np.flatnonzero(there))
+
+
 def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
     """Entries of the model file, one per effect and joint."""
-    entries, n = [], tree.n
-    for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
-        for j in range(n):
-            value, shape = float(outcome.effects[k, j]), float(outcome.shapes[k, j])
-            name, parameters = effect.learned_as(value, shape)
-            entry = {"effect": name, "joints": [j + 1], "parameters": parameters}
-            entry["std"] = {effect.key: float(outcome.effects_std[k, j])}
-            entries.append({**entry, "units": KNOWN[name].units(tree.slides[j])})
+    entries = []
+    for effect, k, j in _learned(outcome):
+        value, shape = float(outcome.effects[k, j]), float(outcome.shapes[k, j])
+        name, parameters = effect.learned_as(value, shape)
+        entry = {"effect": name, "joints": [j + 1], "parameters": parameters}
+        entry["std"] = {effect.key: float(outcome.effects_std[k, j])}
+        entries.append({**entry, "units": KNOWN[name].units(tree.slides[j])})
     return entries
 
 
 def _posterior(outcome: Outcome, theta: Array, told: BaseParameters) -> Posterior:
     """Doubt of all that was learned: of θ and of frames in the directions that data showed."""
     shown, labels, least = outcome.lam_identifiable, [], []
-    for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
-        for j, (value, shape) in enumerate(zip(outcome.effects[k], outcome.shapes[k], strict=True)):
-            labels.append((effect.learned_as(value, shape)[0], j + 1, effect.key))
-            least.append(0.0 if effect.key in effect.positive else -np.inf)
-    way = np.eye(theta.size + len(labels))
+    places = list(range(theta.size))
+    for effect, k, j in _learned(outcome):
+        name, _ = effect.learned_as(float(outcome.effects[k, j]), float(outcome.shapes[k, j]))
+        labels.append((name, j + 1, effect.key))
+        least.append(0.0 if effect.key in effect.positive else -np.inf)
+        places.append(theta.size + k * outcome.effects.shape[1] + j)
+    way = np.eye(theta.size + outcome.effects.size)[places]
     way[: theta.size, : theta.size] = told.shown_map()
     covariance = way @ outcome.joint_covariance @ way.T
     return Posterior(
@@ -340,8 +350,9 @@ def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, An
     found: list[Mapping[str, Any]] = []
     for entry in documented.effects:
         active = active_effects([entry], documented.tree.n)
-        if entry["effect"] not in learned and active[0].lasting:
-            found.append({**entry, "interval_s": None} if "interval_s" in entry else entry)
+        left = [x.entry for x in active if x.lasting and not x.starts(learned)]
+        whole = {**entry, "interval_s": None} if "interval_s" in entry else entry
+        found += [whole] if len(left) == len(active) else left
     return found
 
 

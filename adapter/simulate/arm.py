@@ -77,6 +77,5 @@ def plain_urdf(model: SelfModel) -> str:
     Raises:
         ModelError: a body that cannot exist.
     """
-    return robot_urdf(
-        replace(model, frames=(), limits=Limits.unknown(model.tree.n)), alone=True
-    ).text
+    bare = replace(model, frames=(), limits=Limits.unknown(model.tree.n))
+    return robot_urdf(bare, alone=True).text

@@ -48,11 +48,12 @@ FORMATS: dict[str, tuple[str, ...]] = {
 }
 CROSSING_S = 0.01  # the motor crosses the gear's play in this time
 BAND_HZ = 25.0  # of what twists an elastic joint before a simulation begins
-SLOPE_RAD_S = 1e-3  # over which a law's slope is taken
+SLOPE = 1e-3  # rad/s or rad/s² over which a law's slopes are taken
+ROUNDS, STAYS = 8, 1e-6  # of laws that go with ddq; rad/s² by which the last one changes nothing
 # A law is asked five times at once: without direction, forwards, backwards, faster, accelerated.
-DIRECTIONS = np.array([[0.0], [1.0], [-1.0], [0.0], [0.0]])
-FASTER = np.array([[0.0], [0.0], [0.0], [SLOPE_RAD_S], [0.0]])
-ACCELERATED = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
+DIRECTIONS, FASTER, ACCELERATED = np.array(
+    [[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, SLOPE, 0.0], [0.0, 0.0, 0.0, 0.0, SLOPE]]
+)[..., None]
 
 
 class _Asked(JointSignals):
@@ -75,17 +76,20 @@ class _Stage:
     """What acts between two switches.
 
     Attributes:
-        arm: the rigid body; laws: torques of joints; others: torques that only a table knows;
-            bent: those of bristles.
+        arm: the rigid body; laws: torques of joints by their own signals; by_others: by another's;
+            others: torques that only a table knows; bent: those of bristles.
         sensors: what encoders and torque sensors do; shifts: what the latter add last of all.
+        rounds: how often laws are asked, of which some go with the step's own acceleration.
     """
 
     arm: RigidArm
     laws: ByJoint
+    by_others: ByJoint
     others: tuple[Active, ...]
     bent: tuple[Active, ...]
     sensors: ByJoint
     shifts: ByJoint
+    rounds: int
 
     @classmethod
     def of(cls, arm: RigidArm, acting: Sequence[Active]) -> _Stage:
@@ -97,14 +101,17 @@ class _Stage:
                 last += [a] if a.effect.after_sensors else []
         bent = with_bristles(torques)
         laws = [a for a in torques if isinstance(a.effect, JointTorque) and a not in last + bent]
-        n = arm.n
+        kinds = [a.effect for a in laws if isinstance(a.effect, JointTorque)]
+        n, follow = arm.n, any(x.by_load or "ddq" in x.variables for x in kinds)
         return cls(
             arm,
-            by_joint(laws, n),
+            by_joint([a for a in laws if not a.effect.by], n),
+            by_joint([a for a in laws if a.effect.by], n),
             tuple(a for a in torques if a not in laws + last + bent),
             tuple(bent),
             by_joint([a for a in acting if a not in torques], n),
             by_joint(last, n),
+            ROUNDS if follow else 1,
         )
 
     @cached_property
@@ -115,7 +122,7 @@ class _Stage:
 
 @dataclass(frozen=True, eq=False)
 class _Asking:
-    """What the laws say at an instant, (n,) each: f(dq) = rest + viscous dq + level sign(dq)."""
+    """What laws say about an instant, (n,): rest + viscous dq + level sign(dq) + armature ddq."""
 
     rest: Array
     viscous: Array
@@ -124,14 +131,16 @@ class _Asking:
     armature: Array
 
     @classmethod
-    def of(cls, said: Array, dq: Array) -> _Asking:
-        """Of answers (5, n); friction that drives motion is no friction and acts as it stands."""
+    def of(cls, said: Array, dq: Array, ddq: Array) -> _Asking:
+        """Of answers (5, n) about dq, ddq (n,); friction that drives is none, and acts as it is."""
         forwards, backwards = said[1] - said[0], said[0] - said[2]
         level = np.where(dq > 0.0, forwards, backwards)
         driving = np.minimum(level, 0.0) * np.tanh(dq / SMOOTHING_DQ)
-        viscous = np.maximum((said[3] - said[0]) / SLOPE_RAD_S, 0.0)
+        viscous = np.maximum((said[3] - said[0]) / SLOPE, 0.0)
         least = np.maximum(forwards, 0.0), np.maximum(backwards, 0.0)
-        return cls(said[0] - viscous * dq + driving, viscous, *least, said[4] - said[0])
+        armature = (said[4] - said[0]) / SLOPE
+        rest = said[0] - viscous * dq - armature * ddq + driving
+        return cls(rest, viscous, *least, armature)
 
     def torque(self, u: Array, ddq: Array) -> Array:
         """(n,) N m at the speed u, rad/s, and the acceleration ddq, rad/s²."""
@@ -220,7 +229,7 @@ class Effects:
                 an end act, as if long begun.
         """
         stage = self._stage(t)
-        acting = stage.laws.laws or stage.others or stage.bent
+        acting = stage.laws.laws or stage.by_others.laws or stage.others or stage.bent
         if not acting and stage.arm is self._held:
             return self._nothing.copy()
         return self.at_middle(q, dq, ddq, tau, t, 0.0)
@@ -246,12 +255,15 @@ class Effects:
             body, carried = _dynamics(stage.arm, link, dq + part * self.period_s * last)
         a, u = last, dq
         bent = self._bristles.torque(q, dq, body, stage.bent)
-        for _ in range(2 if stage.laws.by_load else 1):  # what a gear carries follows from a
-            asked = _Asking.of(self._said(stage, (link, dq, carried + body @ a), t) + bent, dq)
+        for _ in range(stage.rounds):
+            at = JointSignals(link, dq, a, carried + body @ a)
+            asked = _Asking.of(self._said(stage, at, t) + bent, dq, a)
             losses = np.array([asked.viscous, asked.forwards, asked.backwards])
             push = tau - carried - asked.rest
             dv, u = speed_change(body + np.diag(asked.armature), push, dq, losses, self.period_s)
-            a = dv / self.period_s
+            before, a = a, dv / self.period_s
+            if np.abs(a - before).max() < STAYS:
+                break
         own = carried + body @ a + asked.torque(u, a)
         # what the simulator takes off at the joints by itself
         pull = self.held(STIFFNESS) * q + self._holds.pull
@@ -334,11 +346,13 @@ class Effects:
             self._stages[k] = _Stage.of(arm, acting)
         return self._stages[k]
 
-    def _said(self, stage: _Stage, state: tuple[Array, Array, Array], t: float | None) -> Array:
-        """Torque (5, n) of all laws, asked five times; `state` is q, dq and the rigid torque."""
-        q, dq, load = (np.tile(x, (5, 1)) for x in state)
-        dq, ddq = dq + FASTER, np.broadcast_to(ACCELERATED, q.shape)
+    def _said(self, stage: _Stage, at: JointSignals, t: float | None) -> Array:
+        """Torque (5, n) of all laws, asked five times, at signals (n,)."""
+        q, dq, ddq, load = (np.tile(x, (5, 1)) for x in at[:4])
+        dq, ddq = dq + FASTER, ddq + ACCELERATED
         said = stage.laws.torque(_Asked(q, dq, ddq, load)) + np.zeros(q.shape)
+        middle = at._replace(dq=at.dq + 0.5 * self.period_s * at.ddq)
+        said += stage.by_others.torque(middle)
         for active in stage.others:
             assert isinstance(active.effect, TorqueEffect)
             begin = active.interval_s[0]
@@ -395,7 +409,6 @@ def _dynamics(arm: RigidArm, q: Array, dq: Array) -> tuple[Array, Array]:
     return tau[2:] - tau[1], tau[0]
 
 
-ROUNDS = 60
 DONE = 1e-10  # rad/s
 ENOUGH = 1e-4  # share of the expected descent that a step must bring
 
@@ -422,7 +435,7 @@ def speed_change(M, push, v, losses, h):
         stiff = (losses[0, i] + max(losses[1, i], losses[2, i]) / SMOOTHING_DQ) * h / M[i, i]
         share[i] = max(0.5, 1.0 - 1.0 / max(stiff, 1.0))
     cost = _cost(M, h * push, v, (losses, share, h), dv)
-    for _ in range(ROUNDS):
+    for _ in range(60):
         gradient[:] = M @ dv - h * push
         hessian[:] = M
         for i in range(n):

@@ -50,9 +50,10 @@ class MujocoArm(SimulatedArm):
         super().__init__(Effects(model, float(self.model.opt.timestep), "bodies and armature"))
         joints = [self._joint(name) for name in model.tree.joint_names]
         self._qpos, self._dofs = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
-        for table in (self.model.dof_damping, self.model.dof_frictionloss):
-            table[self._dofs] = 0.0
-        self.model.jnt_stiffness[joints] = 0.0
+        lost = dict.fromkeys(("dof_damping", "dof_dampingpoly", "dof_frictionloss"), self._dofs)
+        lost |= dict.fromkeys(("jnt_stiffness", "jnt_stiffnesspoly"), joints)
+        for name in lost.keys() & set(dir(self.model)):  # polynomials are MuJoCo 4's
+            getattr(self.model, name)[lost[name]] = 0.0
         self.model.dof_armature[self._dofs] = self.effects.held(ARMATURE)
         self._mujoco.mj_setConst(self.model, self._mujoco.MjData(self.model))
 

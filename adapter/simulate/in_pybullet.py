@@ -42,7 +42,7 @@ class PybulletArm(SimulatedArm):
         super().__init__(Effects(model, period_s, "bodies"))
         self._bullet, self._alone = pybullet, simulated is None
         self.client, self.body = simulated or _alone(model, period_s)
-        body = {"physicsClientId": self.client}
+        body = self._within = {"physicsClientId": self.client}
         count = pybullet.getNumJoints(self.body, **body)
         names = [pybullet.getJointInfo(self.body, j, **body)[1].decode() for j in range(count)]
         lacking = [name for name in model.tree.joint_names if name not in names]
@@ -63,30 +63,25 @@ class PybulletArm(SimulatedArm):
 
     def read(self) -> tuple[Array, Array]:
         """From the joints' states."""
-        states = self._bullet.getJointStates(self.body, self._joints, physicsClientId=self.client)
+        states = self._bullet.getJointStates(self.body, self._joints, **self._within)
         both = np.array([state[:2] for state in states])
         return both[:, 0].copy(), both[:, 1].copy()
 
     def put(self, q: Array, dq: Array) -> None:
         """By resetting the joints."""
         for j, at, speed in zip(self._joints, q.tolist(), dq.tolist(), strict=True):
-            self._bullet.resetJointState(self.body, j, at, speed, physicsClientId=self.client)
+            self._bullet.resetJointState(self.body, j, at, speed, **self._within)
 
     def advance(self, torque: Array) -> None:
         """By `stepSimulation` with torque control."""
-        self._bullet.setJointMotorControlArray(
-            self.body,
-            self._joints,
-            self._bullet.TORQUE_CONTROL,
-            forces=torque.tolist(),
-            physicsClientId=self.client,
-        )
-        self._bullet.stepSimulation(physicsClientId=self.client)
+        motors = self.body, self._joints, self._bullet.TORQUE_CONTROL
+        self._bullet.setJointMotorControlArray(*motors, forces=torque.tolist(), **self._within)
+        self._bullet.stepSimulation(**self._within)
 
     def close(self) -> None:
         """Disconnect a client of its own."""
-        if self._alone and self._bullet.isConnected(physicsClientId=self.client):
-            self._bullet.disconnect(physicsClientId=self.client)
+        if self._alone and self._bullet.isConnected(**self._within):
+            self._bullet.disconnect(**self._within)
 
 
 def _alone(model: SelfModel, period_s: float) -> tuple[int, int]:
@@ -94,18 +89,13 @@ def _alone(model: SelfModel, period_s: float) -> tuple[int, int]:
     pybullet = optional.load("pybullet")
     text = plain_urdf(model)
     client: int = pybullet.connect(pybullet.DIRECT)
+    within, as_written = {"physicsClientId": client}, pybullet.URDF_USE_INERTIA_FROM_FILE
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.urdf"
         path.write_text(text, "utf-8")
-        body: int = pybullet.loadURDF(
-            str(path),
-            useFixedBase=True,
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-            physicsClientId=client,
-        )
-    pybullet.changeDynamics(
-        body, -1, activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
-    )
-    pybullet.setGravity(*model.gravity.tolist(), physicsClientId=client)
-    pybullet.setTimeStep(period_s, physicsClientId=client)
+        body: int = pybullet.loadURDF(str(path), useFixedBase=True, flags=as_written, **within)
+    awake = pybullet.ACTIVATION_STATE_DISABLE_SLEEPING
+    pybullet.changeDynamics(body, -1, activationState=awake, **within)
+    pybullet.setGravity(*model.gravity.tolist(), **within)
+    pybullet.setTimeStep(period_s, **within)
     return client, body

@@ -197,16 +197,17 @@ class FreeFall:
         self.truth = truth
         self.h_s = 1.0 / RATE_HZ
         self._world = bullet.connect(bullet.DIRECT)
+        self._within = {"physicsClientId": self._world}
         self._close = weakref.finalize(self, disconnect, [self._world])
         self._robot = load_urdf(_urdf(truth), self._world, fixed=False)
-        count = bullet.getNumJoints(self._robot, physicsClientId=self._world)
+        count = bullet.getNumJoints(self._robot, **self._within)
         infos = [bullet.getJointInfo(self._robot, j, self._world) for j in range(count)]
         number = {info[1].decode(): info[0] for info in infos}
         self._joints = [number[name] for name in truth.joint_names]
         _, self._com, inertia = body_of(truth.theta[0])
         self._axes = principal(inertia)[1]
-        bullet.setTimeStep(self.h_s, physicsClientId=self._world)
-        bullet.setGravity(*truth.gravity.tolist(), physicsClientId=self._world)
+        bullet.setTimeStep(self.h_s, **self._within)
+        bullet.setGravity(*truth.gravity.tolist(), **self._within)
 
     def place(self, q: Array, dq: Array, w: Array) -> None:
         """Put the tree at the origin, its base level.
@@ -217,35 +218,29 @@ class FreeFall:
             w: (3,) angular velocity of the base in world axes, rad/s; its centre is at rest.
         """
         at = (0.0, 0.0, 0.0)
-        bullet.resetBasePositionAndOrientation(
-            self._robot, at, (0.0, 0.0, 0.0, 1.0), physicsClientId=self._world
-        )
-        bullet.resetBaseVelocity(self._robot, at, w.tolist(), physicsClientId=self._world)
+        level = (0.0, 0.0, 0.0, 1.0)
+        bullet.resetBasePositionAndOrientation(self._robot, at, level, **self._within)
+        bullet.resetBaseVelocity(self._robot, at, w.tolist(), **self._within)
         for j, angle, speed in zip(self._joints, q.tolist(), dq.tolist(), strict=True):
-            bullet.resetJointState(self._robot, j, angle, speed, physicsClientId=self._world)
+            bullet.resetJointState(self._robot, j, angle, speed, **self._within)
 
     def step(self, tau: Array) -> None:
         """Move on by one step under torques (n,) N m."""
-        bullet.setJointMotorControlArray(
-            self._robot,
-            self._joints,
-            bullet.TORQUE_CONTROL,
-            forces=tau.tolist(),
-            physicsClientId=self._world,
-        )
-        bullet.stepSimulation(physicsClientId=self._world)
+        motors = self._robot, self._joints, bullet.TORQUE_CONTROL
+        bullet.setJointMotorControlArray(*motors, forces=tau.tolist(), **self._within)
+        bullet.stepSimulation(**self._within)
 
     def joints(self) -> tuple[Array, Array]:
         """q (n,) rad and dq (n,) rad/s."""
-        states = bullet.getJointStates(self._robot, self._joints, physicsClientId=self._world)
+        states = bullet.getJointStates(self._robot, self._joints, **self._within)
         both = np.array([state[:2] for state in states])
         return both[:, 0], both[:, 1]
 
     def base(self) -> Array:
         """(10,) as PyBullet has it: quaternion x y z w of the base's principal axes, velocity of
         its centre of mass and angular velocity in world axes."""
-        _, turned = bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
-        v, w = bullet.getBaseVelocity(self._robot, physicsClientId=self._world)
+        _, turned = bullet.getBasePositionAndOrientation(self._robot, **self._within)
+        v, w = bullet.getBaseVelocity(self._robot, **self._within)
         return np.array((*turned, *v, *w))
 
     def felt_inertia(self) -> Array:

@@ -17,39 +17,30 @@ from adapter.cli import main
 from adapter.effects.base import JointTorque
 from adapter.effects.c_text import c_text
 from adapter.effects.catalogue import KNOWN
+from adapter.effects.law import CURVES, LAWS, Curve, Law
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
 from sim.fci.server import COMPILER
-from tests.helpers.robot_models import machine_urdf, read_quietly
+from tests.effects.test_law import entries_of
+from tests.helpers.robot_models import entry, machine_urdf, read_quietly
 from tests.simulate.test_rollouts import BALL, CASES, SENSED
 
 compiled = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc, gcc, clang) is here")
-LAWS = (
-    ("law: dq |dq|", 3, {"c": 0.2}),
-    ("law: dq6", 4, {"c": -0.1}),
-    ("law: sign(dq) |dq|^p", 5, {"c": 0.2, "p": 1.5}),
-    ("law: sign(tau) max(|tau| - a, 0)", 6, {"c": 0.1, "a": 0.5}),
-    ("law: sign(dq) sin(n q + phase)", 7, {"c": 0.1, "n": 3.0, "phase": 0.2}),
-    ("law: max(q - a, 0)²", 1, {"c": 0.4, "a": 0.1}),
-    ("law: tanh(tau/a)", 2, {"c": 0.2, "a": 0.3}),
-)
-CURVE = {"x": [0.1, 0.2, 0.3, 0.1, 0.0, 0.2, 0.4, 0.1], "low": -1.0, "high": 1.0}
+FORMS = [law for law in (LAWS | CURVES).values() if law.by in (0, 3)]
 NAMED = [effect.as_dict() for effect in (*CASES, *SENSED)]
-FALLING = {"Fc": 0.3, "Fs": 0.6, "vs": 0.08, "s0": 3e-3}
-BRISTLES = [{"effect": "stribeck_friction", "joints": [5], "parameters": FALLING}]
+BRISTLES = [entry("stribeck_friction", [5], Fc=0.3, Fs=0.6, vs=0.08, s0=3e-3)]
 BRISTLES += [x for x in NAMED if x["effect"] == "bristle_friction"]
 AT_JOINTS = [x for x in NAMED if isinstance(KNOWN[x["effect"]], JointTorque)]
 
 
-def panda(entries: Sequence[Mapping[str, Any]], *laws: tuple[str, int, Any]) -> SelfModel:
+def panda(entries: Sequence[Mapping[str, Any]], *laws: Law | Curve) -> SelfModel:
     """With a load, which comes first, and a tool, on a table that is not level."""
     load = {"effect": "payload", "joints": [], "parameters": BALL}
-    found = [{"effect": e, "joints": [j], "parameters": values} for e, j, values in laws]
     tool, gravity = Tool(0.7, np.full(3, 0.05), 1e-3 * np.eye(3)), np.array([1.0, -2.0, -9.5])
-    effects = (load, *entries, *found)
+    effects = (load, *entries, *entries_of(laws))
     return replace(documented("panda"), effects=effects, tool=tool, gravity=gravity)
 
 
@@ -91,7 +82,7 @@ def close(found: np.ndarray, told: np.ndarray) -> bool:
 
 @compiled
 def test_all_numbers_are_pythons(tmp_path: Path) -> None:
-    model, table = panda(AT_JOINTS, *LAWS), motion(7)
+    model, table = panda(AT_JOINTS, *FORMS), motion(7)
     path = save_model(model, tmp_path / "model.json")
     assert main(["export", str(path), "--c", str(tmp_path / "new.c")]) == 0
     arm = Arm((tmp_path / "new.c").read_text(encoding="utf-8"), tmp_path)
@@ -123,11 +114,11 @@ def test_joints_that_slide(tmp_path: Path) -> None:
 
 
 def test_what_c_cannot_hold_is_said() -> None:
-    written = c_text(panda(NAMED, ("law: curve(q)", 2, CURVE)))
+    written = c_text(panda(NAMED))
     ended = {x["effect"] for x in NAMED if (x.get("interval_s") or [0, None])[1] is not None}
     bodies = {"payload", "base_tilt"}
     held = {x["effect"] for x in AT_JOINTS} | bodies
-    names = {x["effect"] for x in NAMED} - held - ended | {"law: curve(q)"}
+    names = {x["effect"] for x in NAMED} - held - ended
     assert set(written.left_out) == names
     head = written.text.partition("*/")[0]
     assert all(f"{KNOWN[x].title}: no\n" in head for x in names)

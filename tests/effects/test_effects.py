@@ -426,6 +426,7 @@ BAD = {
         r"'stiction'; have: .*coulomb_fric.*; did you mean ",
     ),
     "joint 0": ([entry("coulomb_friction", (0,), Fc=1.0)], r"no joint 0; have: 1 to 7"),
+    "another joint": ([entry("law: dq9", c=1.0)], r"no joint 9; have: 1 to 7"),
     "joint 8": ([entry("coulomb_friction", (8,), Fc=1.0)], r"no joint 8; have: 1 to 7"),
     "half a joint": ([entry("coulomb_friction", (1.5,), Fc=1.0)], r"no joint 1.5"),
     "no joints": ([entry("coulomb_friction", (), Fc=1.0)], r"needs 'joints'; have: 1 to 7"),

@@ -16,7 +16,7 @@ from adapter.effects.torque import ModelTorque
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from tests.helpers.robot_models import pin_model, read_quietly, relative, urdf_text
+from tests.helpers.robot_models import entry, pin_model, read_quietly, relative, urdf_text
 
 SIX = [4e-3, 1e-4, -2e-4, 5e-3, 3e-4, 6e-3]
 LOAD = {"m": 1.3, "cx": 0.02, "cy": -0.03, "cz": 0.09}
@@ -51,10 +51,8 @@ def apart(one: SelfModel, other: SelfModel) -> float:
 
 def test_pinocchio_reads_the_same_arm() -> None:
     model = carrying(*BODIES)
-    oracle, back = (
-        pin_model(robot_urdf(model, alone=True).text),
-        read_quietly(robot_urdf(model, alone=True).text, False),
-    )
+    text = robot_urdf(model, alone=True).text
+    oracle, back = pin_model(text), read_quietly(text, False)
     assert {frame.name for frame in model.frames} < {frame.name for frame in back.frames}
     data = oracle.createData()
     for q, dq, ddq in zip(*signals(7), strict=True):
@@ -77,10 +75,7 @@ def test_a_tilted_base_stands_on_an_upright_link() -> None:
 
 def test_a_base_that_was_tilted_twice_stands_as_it_stands_in_the_model() -> None:
     """One tilt follows the other, about axes that the first has turned."""
-    tilts = [
-        {"effect": "base_tilt", "joints": [], "parameters": {"rx": x, "ry": y}}
-        for x, y in ((0.3, 0.0), (0.0, 0.4))
-    ]
+    tilts = [entry("base_tilt", rx=x, ry=y) for x, y in ((0.3, 0.0), (0.0, 0.4))]
     model = carrying(*tilts)
     assert apart(read_quietly(robot_urdf(model, alone=True).text, False), model) < 1e-9
     assert apart(carrying(*tilts[::-1]), model) > 1e-3
@@ -139,12 +134,7 @@ def test_what_has_no_place_is_in_one_comment() -> None:
         {"effect": "signal_delay", "parameters": {"d": 0.002}},
         {"effect": "bristle_friction", "joints": [3], "parameters": {"Fc": 0.4, "s0": 1e-3}},
         {"effect": "torque_filter", "joints": [3], "parameters": {"d": 0.004, "c": 1e-5}},
-        {
-            "effect": "torque_offset",
-            "joints": [1],
-            "interval_s": [5.0, 6.0],
-            "parameters": {"o": 1.0},
-        },
+        {**entry("torque_offset", [1], o=1.0), "interval_s": [5.0, 6.0]},
     )
     (said,) = comments(robot_urdf(carrying(*LOSSES, *left), alone=True).text)
     for part in (

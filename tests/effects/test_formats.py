@@ -45,11 +45,8 @@ def table() -> str:
     for name, effect in {x.name: x for x in (*CASES, *SENSED, ball)}.items():
         model, title = model_with(replace(effect, interval_s=None)), KNOWN[name].title
         kept = [additions(model, places).kept for places in list(PLACES.values())[:4]]
-        cells = [
-            title,
-            *(kept_lines(own[:1])[0].partition(": ")[2] for own in (*kept, c_text(model).kept)),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
+        heads = (kept_lines(own[:1])[0] for own in (*kept, c_text(model).kept))
+        lines.append(f"| {' | '.join((title, *(x.partition(': ')[2] for x in heads)))} |")
     return "\n".join(lines)
 
 

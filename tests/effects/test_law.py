@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -28,29 +28,21 @@ from adapter.effects.kept import keep, read_kept, with_kept
 from adapter.effects.law import CURVES, LAWS, Curve, Law, splines
 from adapter.effects.phrases import SPEEDS, Phrase, experiments
 from adapter.effects.robots import robot_urdf
-from adapter.errors import ModelError, SettingsError
+from adapter.errors import SettingsError
 from adapter.gap.result import GapResult
 from adapter.gap.words import as_json, headline
 from adapter.gap.workflow import find_gap
+from adapter.learning.known_effects import as_told, learnable, not_learned
 from adapter.model.model_file import load_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf_text import DAMPING, Additions
 from adapter.physics.rigid_arm import RigidArm
-from adapter.simulate import SIMULATORS, DrivenMotion, Rollouts
+from adapter.simulate import SIMULATORS
 from drivers.files.mcap import Log
-from sim.effects import Effect
-from tests.helpers.arm_data import (
-    ArmData,
-    Motion,
-    arm,
-    learner_for,
-    panda_model,
-    record,
-    states_of,
-    trajectory,
-)
-from tests.sim.test_sim_effects import Record, arm_with
+from tests.helpers.arm_data import Motion, arm, panda_model, record, trajectory
+from tests.helpers.robot_models import entry
+from tests.simulate.test_effects import READY
 
 N, J = 7, 1  # joints; the one that has a law, from 0
 PANDA = documented("panda")
@@ -72,10 +64,20 @@ def values_of(law: Law | Curve) -> dict[str, Any]:
     return {"c": 0.7} | {p.key: max(0.4, 1.4 * p.lower) for p in law.parameters[1:]}
 
 
+def entries_of(laws: Sequence[Law | Curve]) -> list[dict[str, Any]]:
+    """Of a model, joint after joint; what goes with the load is a hundredth."""
+    entries = []
+    for k, law in enumerate(laws):
+        values = values_of(law)
+        key = law.parameters[0].key
+        values |= {key: np.multiply(0.01, values[key]).tolist()} if law.by_load else {}
+        entries.append(entry(law.name, [k % N + 1], **values))
+    return entries
+
+
 def torque_of(law: Law | Curve, values: dict[str, Any]) -> np.ndarray:
     """(m, n) that a model with the law on a joint says more than one without."""
-    entry = {"effect": law.name, "joints": [J + 1], "parameters": values}
-    model = replace(PANDA, effects=(entry,))
+    model = replace(PANDA, effects=(entry(law.name, [J + 1], **values),))
     return np.asarray(adapter.inverse_dynamics(model, Q, DQ, DDQ)) - TAU
 
 
@@ -93,17 +95,35 @@ def test_a_law_is_what_its_name_says(name: str) -> None:
 )
 def test_one_instant_shows_as_much_as_a_table(law: Law | Curve) -> None:
     values = values_of(law)
-    entry = {"effect": law.name, "joints": [J + 1], "parameters": values}
-    sums = by_joint(active_effects([entry], N), N)
+    sums = by_joint(active_effects([entry(law.name, [J + 1], **values)], N), N)
     for row in (3, 80, 150):
         at = JointSignals(Q[row], DQ[row], DDQ[row], TAU[row])
         whole = torque_of(law, values)[row]
         np.testing.assert_allclose(sums.torque(at), whole, rtol=1e-9, atol=1e-9)
 
 
-def test_a_law_of_a_joint_that_is_not_there_is_refused() -> None:
-    with pytest.raises(ModelError, match="no joint 9; have: 1 to 7"):
-        torque_of(LAWS["law: dq9"], {"c": 1.0})
+@pytest.mark.parametrize("simulator", list(SIMULATORS))
+@pytest.mark.parametrize(
+    "name", [*FORMULAS, "law: ddq |ddq|", "law: sign(dq3)", "law: tau²", "law: dq q", "drag"]
+)
+def test_a_law_acts_in_the_simulators(name: str, simulator: str) -> None:
+    """What a step does to the motion is, at its middle, what the model says that torques do."""
+    law, q0, strength = {**LAWS, **CATALOGUE}[name], READY, np.array([4.0] * 4 + [0.6, 0.6, 0.3])
+    values = values_of(law) | ({"c": 0.1} if "tau" in name else {})
+    model = replace(PANDA, effects=(entry(name, [J + 1], **values),))
+    drive = strength * np.sin(np.outer(1e-3 * np.arange(200), 5.0 + np.arange(N)) + 1.0)
+    drive += np.asarray(adapter.inverse_dynamics(PANDA, q0, *np.zeros((2, N))))
+    own = SIMULATORS[simulator](model)
+    own.place(q0, 0.1 * strength)
+    states = [own.state()]
+    for tau in drive:
+        own.step(tau)
+        states.append(own.state())
+    own.close()
+    q, dq = np.array(states).swapaxes(0, 1)
+    middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (dq[1:] + dq[:-1]), np.diff(dq, axis=0) / 1e-3
+    with_law, without = (np.asarray(adapter.inverse_dynamics(x, *middle)) for x in (model, PANDA))
+    assert np.abs(with_law - drive)[5:].max() < 0.01 < 0.05 < np.ptp((with_law - without)[:, J])
 
 
 def test_units_are_those_of_torque_over_signals() -> None:
@@ -161,7 +181,8 @@ def test_splines_are_scipys() -> None:
     knots = -2.0 + np.arange(-3, 9)
     own = BSpline.design_matrix(np.minimum(x, 3.0 - 1e-9), knots, 3).toarray().T
     np.testing.assert_allclose(splines(x, -2.0, 3.0), own, atol=1e-8)
-    assert np.array_equal(splines(x + 9.0, -2.0, 3.0)[:, -1], splines(x, -2.0, 3.0)[:, -1])
+    ends = (np.array(splines(moved, -2.0, 3.0))[:, -1] for moved in (x + 9.0, x))
+    assert np.array_equal(*ends)
 
 
 def test_what_no_expression_is_joins_the_model_as_a_curve() -> None:
@@ -178,13 +199,47 @@ def test_what_no_expression_is_joins_the_model_as_a_curve() -> None:
     assert np.mean(np.abs(away) < 2.0 * curve["std_nm"]) > 0.9
 
 
-def test_the_coefficient_of_a_law_in_a_model_is_learned_on() -> None:
-    (log, c), name = LAWS_HIDDEN[0].recorded(), LAWS_HIDDEN[0].name
-    entry = {"effect": name, "joints": [J + 1], "parameters": {"c": 0.5 * c}}
-    learned = adapter.learn(log, replace(panda_model(), effects=(entry,)), every=10)
-    assert abs(learned.effects[name][J] - c) < 0.1 * c
-    entries = [e for e in learned.model.effects if (e["effect"], e["joints"]) == (name, [J + 1])]
-    assert [e["parameters"]["c"] for e in entries] == [learned.effects[name][J]]
+IN_MODEL: list[tuple[str, int, dict[str, float]]] = [
+    ("law: max(q - a, 0)²", 2, {"c": 4.0, "a": 0.04}),
+    ("law: dq3 |dq3|", 1, {"c": 1.5}),
+    ("law: dq sin(n q + phase)", 4, {"c": 2.0, "n": 3.0, "phase": 0.4}),
+    ("law: dq³", 7, {"c": 0.8}),
+    ("drag", 6, {"c": 1.2}),
+    ("law: tau²", 5, {"c": 0.02}),
+]
+
+
+def test_coefficients_of_laws_in_a_model_are_learned_on() -> None:
+    """Where the model's are 30 % off, as those of an effect of one's own; or it is said."""
+    entries = [entry(x, [j], **v) for x, j, v in IN_MODEL]
+    data = record(arm(), Motion(20.0, seed=4))
+    bare, true = panda_model(), replace(panda_model(), effects=tuple(entries))
+    more, rigid = (np.asarray(adapter.inverse_dynamics(x, *data.true[:3])) for x in (true, bare))
+    log = replace(data, tau=data.tau + more - rigid).log()
+    off = [entry(x, [j], **(v | {"c": 0.7 * v["c"]})) for x, j, v in IN_MODEL]
+    learned = adapter.learn(log, replace(bare, effects=(*off[:-1], entries[-1])), every=4)
+    found = {(e["effect"], e["joints"][0]): e for e in learned.model.effects}
+    assert found.pop(("law: tau²", 5)) == entries[-1]
+    for name, joint, values in IN_MODEL[:-1]:
+        own = found.pop((name, joint))
+        c, doubt = own["parameters"]["c"], own["std"]["c"]
+        assert abs(c - values["c"]) < max(3.0 * doubt, 0.05 * values["c"]) < 0.3 * values["c"]
+        assert own["parameters"] == {**values, "c": c}
+    assert not any(name.startswith("law") for name, _ in found)
+    names = learnable(learned.model, ())
+    assert set(names) == set(learned.effects) and "law: max(q - a, 0)² at a = 0.04" in names
+    *_, said = not_learned(learned.model, names)
+    assert said.startswith("joint 5: torque of c tau², stays as it is")
+
+
+def test_a_kept_law_is_learned_at_the_setting_that_the_model_has(tmp_path: Path) -> None:
+    name, joint, _ = IN_MODEL[0]
+    model = replace(PANDA, effects=(entry(name, [joint], c=4.0, a=0.05),))
+    file = tmp_path / "own.toml"
+    file.write_text('[hose]\nlaw = "max(q - a, 0)²"\nc = 4.0\na = 0.04\n')
+    named = effects_named(f"torque_offset,{file}")
+    assert as_told(model, named) == ("torque_offset", f"{name} at a = 0.05")
+    assert as_told(PANDA, named) == ("torque_offset", f"{name} at a = 0.04")
 
 
 @pytest.fixture
@@ -216,12 +271,14 @@ def test_the_command_lists_kept_laws_too(kept: Path, capsys: pytest.CaptureFixtu
     assert "hose_joint_2" in said and "bristle_friction" in said and "tanh(tau/a)" in said
 
 
-def test_a_kept_law_is_learned_beside_others_where_it_has_no_setting(tmp_path: Path) -> None:
+def test_a_kept_law_is_learned_beside_others(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     file.write_text('[oil]\nlaw = "dq |dq|"\nc = 0.7\n')
     assert effects_named(f"viscous_friction,{file}") == ("viscous_friction", "law: dq |dq|")
     file.write_text('[hose]\nlaw = "max(q - a, 0)"\nc = 2.0\na = 0.1\n')
-    with pytest.raises(SettingsError, match=r"\[hose\] is c max\(q - a, 0\): .* not learned"):
+    assert effects_named(str(file)) == ("law: max(q - a, 0) at a = 0.1",)
+    file.write_text('[gear]\nlaw = "tau²"\nc = 2.0\n')
+    with pytest.raises(SettingsError, match=r"\[gear\] is c tau²: .* not learned"):
         effects_named(str(file))
 
 
@@ -292,29 +349,15 @@ def drag() -> Iterator[Drag]:
     assert own.name not in CATALOGUE
 
 
-def stirring(seconds: float) -> ArmData:
-    """A recording of an arm with drag on one joint."""
-    data = record(arm(), Motion(seconds, seed=4))
-    dq = data.true[1]
-    return replace(data, tau=data.tau + C * dq * np.abs(dq) * np.eye(N)[J])
-
-
 def with_drag() -> SelfModel:
-    entry = {"effect": "drag", "joints": [J + 1], "parameters": {"c": C}}
-    return replace(panda_model(), effects=(entry,))
-
-
-def test_it_is_learned() -> None:
-    learner = learner_for(effects=("drag",))
-    for state in states_of(stirring(12.0)):
-        learner.step(state)
-    values = learner.theta.effect_values[0]
-    assert values[J] == pytest.approx(C, abs=0.1)
-    assert np.abs(np.delete(values, J)).max() < 0.2
+    return replace(panda_model(), effects=(entry("drag", [J + 1], c=C),))
 
 
 def test_it_is_named() -> None:
-    result = find_gap([stirring(15.0).log()], panda_model())
+    data = record(arm(), Motion(15.0, seed=4))
+    dq = data.true[1]
+    tau = data.tau + C * dq * np.abs(dq) * np.eye(N)[J]
+    result = find_gap([replace(data, tau=tau).log()], panda_model())
     (found,) = [f for f in result.findings if f.effect == "drag"]
     assert found.joints == (J + 1,)
     assert abs(found.parameters["c"] - C) < min(5.0 * found.std["c"], 0.1)
@@ -327,20 +370,6 @@ def test_it_is_told_from_all_others(drag: Drag) -> None:
     for other in set(CATALOGUE.values()) - {drag}:
         (said,) = experiments(drag, [other])
         assert "drag" in said and other.title in said
-
-
-@pytest.mark.parametrize("simulator", list(SIMULATORS))
-def test_it_is_simulated(simulator: str) -> None:
-    """As the simulated arm moves that has the same equation of its own."""
-    made = Record(arm_with(Effect("x_quadratic_drag", (J + 1,), {"c": C})), 0.6)
-    motion = DrivenMotion(made.t, made.read_q, made.read_dq, made.u)
-    rollouts = Rollouts(simulator)
-    off = [
-        np.nanmax(np.abs(rollouts(model, motion, [(100, 600)], "commands")[0] - made.read_q))
-        for model in (with_drag(), panda_model())
-    ]
-    assert rollouts.troubles == []
-    assert off[0] < 1e-4 < 1e-3 < off[1]
 
 
 def test_it_is_exported() -> None:

@@ -13,7 +13,7 @@ from adapter.effects.active import active_effects, lasting_effects, with_bodies
 from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
-from adapter.learning.known_effects import KnownEffects, believed, learnable, not_taken_off
+from adapter.learning.known_effects import KnownEffects, believed, learnable, not_learned
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.learning.theta import STEP_SMOOTHING, KnownArm
@@ -39,16 +39,13 @@ from tests.helpers.arm_data import (
     teach,
 )
 from tests.helpers.gap_effects import sense
+from tests.helpers.robot_models import entry
 
 N = 7
 AT = StateLayout(N)
 MOTION = Motion(10.0, seed=4)
 LOAD = {"m": 1.0, "cx": 0.0, "cy": 0.01, "cz": 0.08, "inertia": [2e-3, 0, 0, 2e-3, 0, 2e-3]}
 FRICTION = ("viscous_friction", "coulomb_friction")
-
-
-def entry(name: str, joints: object = (), **parameters: object) -> dict[str, object]:
-    return {"effect": name, "joints": list(joints), "parameters": parameters}  # type: ignore[call-overload]
 
 
 def with_effects(*entries: dict[str, object], model: SelfModel | None = None) -> SelfModel:
@@ -268,10 +265,8 @@ def test_what_ended_with_its_recording_is_not_looked_for() -> None:
     assert learner.known is None and learner.given == ()
     assert learnable(model, ()) == ()
     assert learned_model(collect(learner), model).effects == ()
-    begun = {**contact, "interval_s": [1.0, None]}
-    (kept,) = learned_model(
-        collect(make_learner(with_effects(begun), PipelineSettings())), with_effects(begun)
-    ).effects
+    begun = with_effects({**contact, "interval_s": [1.0, None]})
+    (kept,) = learned_model(collect(make_learner(begun, PipelineSettings())), begun).effects
     assert kept["interval_s"] is None and kept["parameters"] == {"o": 3.0}
 
 
@@ -295,10 +290,9 @@ def test_a_checkpoint_goes_on_where_it_was(tmp_path: Path) -> None:
 
 def test_what_cannot_be_taken_off_is_said() -> None:
     drift = entry("friction_drift", [2], dFc=0.01)
-    assert not_taken_off(with_effects(drift, entry("base_tilt", rx=0.01, ry=0.0))) == (
-        "friction_drift",
-    )
-    assert not_taken_off(panda_model()) == ()
+    model = with_effects(drift, entry("base_tilt", rx=0.01, ry=0.0))
+    assert not_learned(model, ()) == ["the learner leaves out friction_drift"]
+    assert not_learned(panda_model(), ()) == []
 
 
 def test_batches_take_off_what_is_known() -> None:

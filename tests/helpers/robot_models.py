@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -265,3 +266,8 @@ def relative(found: object, expected: object) -> float:
     a, b = np.asarray(found), np.asarray(expected)
     assert a.shape == b.shape
     return float(np.max(np.abs(a - b)) / np.max(np.abs(b)))
+
+
+def entry(name: str, joints: Iterable[int] = (), **parameters: object) -> dict[str, object]:
+    """Of a model's effects."""
+    return {"effect": name, "joints": list(joints), "parameters": parameters}

@@ -20,6 +20,7 @@ import pytest
 from adapter.errors import MeansError, SettingsError
 from adapter.model import model_file
 from adapter.physics.identifiability import base_parameters
+from adapter.report.fleet_page import summary, write_fleet_page
 from adapter.runs.config import PipelineSettings
 from adapter.runs.fleet import fleet as fleets
 from adapter.runs.fleet.arm import FleetArm, learn_arm
@@ -44,6 +45,7 @@ from sim.scenarios import build
 from sim.truth import Truth
 from tests.helpers.arm_data import Motion, panda_model, record, rubbing
 from tests.helpers.gap_effects import regressor
+from tests.helpers.robot_models import entry
 
 DAY_NS = 86_400 * 10**9
 # The log with a load; joint (from 1) whose friction grows; another arm.
@@ -103,6 +105,20 @@ def off(ours: FleetArm, theirs: FleetArm) -> float:
     std = np.r_[np.sqrt(outcome.covariance.diagonal()), np.zeros(10), outcome.effects_std.ravel()]
     known = std > 0.0
     return float(np.max(np.abs(ours.solution - theirs.solution)[known] / std[known]))
+
+
+def test_a_law_that_only_some_arms_have_is_told(tmp_path: Path) -> None:
+    model = replace(panda_model(), effects=(entry("law: dq³", [2], c=1.0),))
+    for name, c in (("A", 2.0), ("B", 0.0)):
+        data = record(rubbing(0.3, 0.2), Motion(8.0, 50))
+        data = replace(data, tau=data.tau + c * data.true[1] ** 3 * np.eye(7)[1])
+        write_log(data.log(), tmp_path / f"{name}.mcap", {"serial": name})
+    found = learn_fleet(found_logs([str(tmp_path)]), model, Settings(tmp_path, workers=0))
+    _, said = summary(found)
+    assert said.startswith("Not all arms have a torque of c dq³ on joint 2 (N m s³/rad³): A has (")
+    assert (
+        ", B not (" in said and said in write_fleet_page(found, tmp_path / "page.html").read_text()
+    )
 
 
 def test_logs_are_told_apart_and_broken_ones_said(fleet: Fleet) -> None:

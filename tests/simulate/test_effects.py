@@ -21,8 +21,7 @@ from adapter.simulate import FORMATS, SIMULATORS, Effects, MujocoArm, Rollouts
 from sim.effects import Effect
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model
-from tests.helpers.gap_effects import joint_torque
-from tests.simulate.test_rollouts import CASES, PANDA, SENSED, model_with
+from tests.simulate.test_rollouts import PANDA, model_with
 
 READY = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])
 DQ = np.array([0.4, -0.5, 0.6, 0.3, -0.7, 0.8, -0.9])
@@ -52,23 +51,6 @@ def placed(simulator: str, model: SelfModel, dq: np.ndarray = STILL) -> Any:
     arm = SIMULATORS[simulator](model)
     arm.place(READY, dq)
     return arm
-
-
-def test_the_torque_is_that_of_the_effects_own_equations() -> None:
-    """Where nothing is stiff; the torque's offset is a sensor's."""
-    effects = (
-        Effect("viscous_friction", (1,), {"Fv": 0.6}),
-        Effect("coulomb_friction", (2,), {"Fc": 0.5}),
-        Effect("stribeck_friction", (4,), {"Fc": 0.4, "Fs": 1.0, "vs": 0.3}),
-        Effect("torque_ripple", (5,), {"a": 0.4, "n": 6.0, "phase": 0.2}),
-        Effect("torque_offset", (6,), {"o": 2.0}),
-        Effect("friction_drift", (7,), {"dFc": 0.02}),
-    )
-    rigid = torque_of(READY, DQ)
-    added = Effects(model_with(*effects), 1e-6, "bodies")(READY, DQ, STILL, rigid, 5.0)
-    rows = (np.array([x]) for x in (5.0, READY, DQ, STILL))
-    wanted = joint_torque(panda(), effects, *rows)[0]
-    np.testing.assert_allclose(added, rigid - wanted, atol=2e-3)
 
 
 def test_friction_goes_with_the_load_of_this_very_step() -> None:
@@ -275,9 +257,3 @@ def test_what_does_not_fit_is_refused() -> None:
     arm = MujocoArm(PANDA)
     with pytest.raises(ModelError, match="no joint 'a'; has: panda_joint1"):
         MujocoArm(other, (arm.model, arm.data))
-
-
-def test_every_effect_is_simulated() -> None:
-    """Of the catalogue, all is done on one side or the other."""
-    for effect in (*CASES, *SENSED):
-        assert Effects(model_with(effect)).left_out == ()
