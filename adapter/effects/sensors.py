@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from adapter.effects import base as base
@@ -137,10 +135,12 @@ class TorqueFilter(base.LearnedEffect, base.SensorEffect):
     def templates(self) -> tuple[base.Template, ...]:
         """Of a motor's or a sensor's electronics; and a slow one of one time constant."""
 
-        def of_first_order(x: Array) -> dict[str, Any]:
-            return {"d": float(x[0]), "c": float(x[0]) ** 2}
-
-        slow = base.Template((SLOW_S,), of_first_order, "of first order", chord=True)
+        slow = base.Template(
+            (SLOW_S,),
+            lambda x: {"d": float(x[0]), "c": float(x[0]) ** 2},
+            "of first order",
+            chord=True,
+        )
         return (*super().templates(), slow)
 
     def possible(self, values: Values) -> bool:

@@ -201,8 +201,22 @@ class RolloutCurves:
     after: Array
 
 
+class InUnits:
+    """A result whose joints turn or slide: `slides` (n,), empty where none does."""
+
+    slides: tuple[bool, ...] = ()
+
+    def unit(self, unit: str, joint: int | None = None) -> str:
+        """A unit of turning joints as it is of a joint (from 0), or of all: N m (N of joint 1)."""
+        own = [j for j, slides in enumerate(self.slides) if slides]
+        if joint is not None:
+            return of_sliding(unit) if joint in own else unit
+        sliding = f" ({of_sliding(unit)} of joint {', '.join(str(j + 1) for j in own)})"
+        return unit + sliding * bool(own)
+
+
 @dataclass(frozen=True)
-class GapResult:
+class GapResult(InUnits):
     """All that `adapter gap` says.
 
     Attributes:
@@ -261,14 +275,6 @@ class GapResult:
     torque_gains: dict[str, Any] | None = None
     sampled: tuple[dict[str, Any], ...] = ()
     slides: tuple[bool, ...] = ()
-
-    def unit(self, unit: str, joint: int | None = None) -> str:
-        """A unit of turning joints as it is of a joint (from 0), or of all: N m (N of joint 1)."""
-        own = [j for j, slides in enumerate(self.slides) if slides]
-        if joint is not None:
-            return of_sliding(unit) if joint in own else unit
-        sliding = f" ({of_sliding(unit)} of joint {', '.join(str(j + 1) for j in own)})"
-        return unit + sliding * bool(own)
 
     def __repr__(self) -> str:
         if self.problem is not None:

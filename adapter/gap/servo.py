@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.gap import servo_kernels as col
 from adapter.gap.hand import FACES, hand_frame
 from adapter.gap.result import RolloutCurves
 from adapter.gap.servo_fit import (
     ALL_FREE,
     BY_GAIN,
     PARAMETERS,
+    SHAPE,
     Freedom,
     JointFit,
     JointTask,
@@ -29,22 +31,7 @@ from adapter.gap.servo_fit import (
     misfit,
 )
 from adapter.gap.servo_ground import LEAST_JOINTS, Tip, find_ground
-from adapter.gap.servo_kernels import (
-    DAMPING,
-    DEAD,
-    DELAY,
-    INERTIA,
-    LEAD,
-    NO_GROUND,
-    PLAY,
-    RUBS,
-    STICKS,
-    TIGHT,
-    WITHIN,
-    A,
-    Ground,
-    Load,
-)
+from adapter.gap.servo_kernels import NO_GROUND, SLIP, Ground, Load
 from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_result import DOCUMENTED_SHARE, SURE, Findings, ServoGap, rms
 from adapter.gap.servo_signals import Track, loads, over_ground
@@ -93,19 +80,20 @@ class _Arm:
     tips: tuple[Tip, ...] = ()
 
     def fixed(self, j: int) -> Array:
-        """(11,) documented parameters of a joint, as `Freedom` takes them."""
+        """(12,) documented parameters of a joint, as `Freedom` takes them."""
         servos = self.documented
         x = servos.table()[j]
         kp = servos.position_gain[j]
-        x[WITHIN] = x[WITHIN] / x[DAMPING] if x[DAMPING] > 0.0 else 0.0
+        x[col.WITHIN] = x[col.WITHIN] / x[col.DAMPING] if x[col.DAMPING] > 0.0 else 0.0
         if np.isfinite(kp):
             x[BY_GAIN] *= kp
-            x[TIGHT] /= kp
+            x[col.TIGHT] /= kp
         return x
 
     def plain(self, j: int) -> Freedom:
         """Of a joint of which every number is free but limits, dead band and backlash."""
-        return Freedom(ALL_FREE.free, np.where(np.arange(PARAMETERS) > DELAY, self.fixed(j), 0.0))
+        others = np.arange(PARAMETERS) > col.DELAY
+        return Freedom(ALL_FREE.free, np.where(others, self.fixed(j), 0.0))
 
     def tasks(self, motions: Sequence[Array]) -> list[JointTask]:
         """One for each joint, all judged readings, under the loads of these motions."""
@@ -181,12 +169,12 @@ def explain(
     if hand.parent == hand.name:  # nothing rides on the last link, which may be a jaw
         hand = next((x for x in model.frames[::-1] if x.parent in model.tree.link_names), hand)
     place = arm.rigid, model.tree.link_names.index(hand.parent), hand.position
-    found = Findings(documented)
+    found = Findings(documented, model.tree.slides)
     for j, fit in enumerate(fits):
         found.add_joint(j, fit)
     for j, fit in enumerate(fits):
-        if fit.x[DELAY] != documented.delay_s:
-            found.add("servo_delay", j, fit.x[DELAY], fit.delay_std, documented.delay_s)
+        if fit.x[col.DELAY] != documented.delay_s:
+            found.add("servo_delay", j, fit.x[col.DELAY], fit.delay_std, documented.delay_s)
     return ServoGap(
         joint_names=names,
         model_name=model.name,
@@ -202,6 +190,7 @@ def explain(
         ground=ground,
         touched=touched,
         notes=(*(w for log in logs for w in log.warnings), *found.notes),
+        slides=tuple(model.tree.slides) if any(model.tree.slides) else (),
     )
 
 
@@ -254,7 +243,7 @@ def _rough(arm: _Arm, logs: Sequence[Log], noise: Array) -> tuple[_Arm, list[Joi
         arm = replace(arm, ground=ground)
         tasks = replace(arm, tracks=tracks).tasks(motions)
     if arm.documented.is_ideal:
-        arm = replace(arm, usual=float(np.median(x[:, A])))
+        arm = replace(arm, usual=float(np.median(x[:, col.A])))
     fits = [
         _limited(JointFit(replace(task, usual=arm.usual), fit.freedom, own), noise[j])
         for j, (task, fit, own) in enumerate(zip(tasks, fits, x, strict=True))
@@ -274,9 +263,9 @@ def _limited(fit: JointFit, noise: float) -> JointFit:
     equation = equations(fit.task)
     while np.sqrt(fit.error() / sum(map(np.sum, fit.task.rows))) > NOISE_SHARE * noise:
         fits = []
-        kinds = (STICKS, None), (TIGHT, 0.0), (TIGHT, 1.0), (DEAD, None), (PLAY, None)
-        for k, within in kinds:
-            if fit.freedom.free[k] or (within == 1.0 and fit.x[LEAD] > 0.0):
+        limited = [(col.TIGHT, share) for share in (0.0, 1.0)]
+        for k, within in [(col.STICKS, None), *limited, (col.DEAD, None), (col.PLAY, None)]:
+            if fit.freedom.free[k] or (within == 1.0 and fit.x[col.LEAD] > 0.0):
                 continue
             freedom = fit.freedom.beside(k, within)
             starts = (freedom.full(x[freedom.free]) for x in guesses(equation, fit.x, k))
@@ -291,8 +280,8 @@ def _limited(fit: JointFit, noise: float) -> JointFit:
 
 
 def _needed(fit: JointFit, asked: NDArray[np.bool_]) -> JointFit:
-    """A fit without those extras asked for, (11,), that explain too little beside the rest."""
-    for k in range(STICKS, WITHIN):
+    """A fit without those extras asked for, (12,), that explain too little beside the rest."""
+    for k in range(col.STICKS, col.SLIPS):
         if asked[k] and fit.freedom.free[k]:
             without = fit_joint(fit.task, fit.freedom.without(k), fit.x)
             fit = fit if _explains(fit, without, k) else without
@@ -301,7 +290,7 @@ def _needed(fit: JointFit, asked: NDArray[np.bool_]) -> JointFit:
 
 def _explains(fit: JointFit, without: JointFit, k: int) -> bool:
     """Whether parameter k, which a fit has and another has not, explains enough of what is left."""
-    share = STATIC_SHARE if k == STICKS else LIMITED_SHARE
+    share = STATIC_SHARE if k == col.STICKS else LIMITED_SHARE
     least = max(LIMITED_CHI2 * fit.unit, share * without.error())
     return without.error() - fit.error() > least and _paid(fit, without) > LIMITED_CHI2
 
@@ -333,11 +322,11 @@ def _named(arm: _Arm, fits: list[JointFit], progress: Callable[[str], None]) -> 
 def _with_lead(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
     """Whether the servos know the command's speed is one question for the whole arm."""
     told = bool(arm.documented.feeds_speed.any())
-    start = [np.where(np.arange(PARAMETERS) == LEAD, 0.0, fit.x) for fit in fits]
+    start = [np.where(np.arange(PARAMETERS) == col.LEAD, 0.0, fit.x) for fit in fits]
     without = []
     for fit, x in zip(fits, start, strict=True):
-        x[DAMPING] = max(fit.x[DAMPING] - fit.x[LEAD], 0.0)
-        without.append(fit_joint(fit.task, fit.freedom.without(LEAD), x))
+        x[col.DAMPING] = max(fit.x[col.DAMPING] - fit.x[col.LEAD], 0.0)
+        without.append(fit_joint(fit.task, fit.freedom.without(col.LEAD), x))
     # more than half of the joints that move decide it: a few may have servos of another kind
     moves = {j for t in arm.tracks for j in moving_joints(t.smooth[0], t.smooth[1], t.step_s)}
     pays = np.array([_paid(fits[j], without[j]) for j in moves])
@@ -352,12 +341,12 @@ def _with_one_delay(
 
     Inertias that are off move it in all joints at once.
     """
-    delays = np.array([fit.x[DELAY] for fit in fits])
+    delays = np.array([fit.x[col.DELAY] for fit in fits])
     noise, moved = [], []
     for fit in fits:
-        at, j = int(fit.freedom.free[:DELAY].sum()), fit.task.joint
+        at, j = int(fit.freedom.free[: col.DELAY].sum()), fit.task.joint
         noise.append(fit.scale[at] ** 2 * fit.noise_covariance[at, at])
-        moved.append(fit.scale[at] * fit.moved([[own[j] for own in each] for each in drawn])[:, at])
+        moved.append(fit.scale[at] * fit.under([[own[j] for own in each] for each in drawn])[:, at])
     together = np.diag(np.maximum(noise, LEAST_DELAY_S**2)) + np.cov(moved, bias=True)
     weight = np.linalg.solve(together, np.ones(len(fits)))
     delay = float(weight @ delays / weight.sum())
@@ -370,8 +359,8 @@ def _with_one_delay(
     found = []
     for fit in fits:
         documented = fit.freedom.documented.copy()
-        documented[DELAY] = delay
-        freedom = replace(fit.freedom, documented=documented).without(DELAY)
+        documented[col.DELAY] = delay
+        freedom = replace(fit.freedom, documented=documented).without(col.DELAY)
         found.append(replace(fit_joint(fit.task, freedom, fit.x), delay_std=std))
     return found
 
@@ -396,20 +385,20 @@ def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]
     """
     j, fixed = fit.task.joint, arm.fixed(fit.task.joint)
     others = [[own[j] for own in each] for each in drawn]
-    fixed[DELAY], fixed[WITHIN] = fit.x[DELAY], fit.freedom.documented[WITHIN]
+    fixed[col.DELAY], fixed[col.WITHIN] = fit.x[col.DELAY], fit.freedom.documented[col.WITHIN]
     known = np.isfinite(arm.documented.position_gain[j])
-    if not fit.freedom.free[LEAD] and not arm.documented.feeds_speed[j]:
-        fixed[LEAD] = 0.0
+    if not fit.freedom.free[col.LEAD] and not arm.documented.feeds_speed[j]:
+        fixed[col.LEAD] = 0.0
     while True:
         values, covariance = physical(fit, others)
         doubt = np.sqrt(np.diagonal(covariance))
-        goal = fixed[:WITHIN].copy()
-        goal[A] = 1.0 / goal[A] if known else np.nan
+        goal = fixed[: col.WITHIN].copy()
+        goal[col.A] = 1.0 / goal[col.A] if known else np.nan
         with np.errstate(invalid="ignore", divide="ignore"):
             far = np.abs(values - goal) / np.hypot(doubt, DOCUMENTED_SHARE * goal)
-        far[~fit.freedom.free[:WITHIN]] = np.inf
+        far[~fit.freedom.free[: col.WITHIN]] = np.inf
         if not known:
-            far[A] = np.inf
+            far[col.A] = np.inf
         k = int(np.nanargmin(far))
         freedom = Freedom(fit.freedom.free, fixed).without(k)
         without = fit_joint(fit.task, freedom, freedom.full(fit.x[freedom.free]))
@@ -420,66 +409,66 @@ def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]
 
 
 def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Array, Array]:
-    """A servo's numbers (10,), SI, and their covariance (10, 10), as the table's columns.
+    """A servo's numbers (11,), SI, and their covariance (11, 11), as the table's columns.
 
     kp, gain of the command's speed, damping, armature, Coulomb, delay (no doubt of it), stiction,
-    one over the torque's limit, dead band, half the backlash.
+    one over the torque's limit, dead band, half the backlash, speed at which stiction is gone.
 
     Args:
         others: loads of arms whose inertias are as wrong as they may be.
     """
-    x, a = fit.x, fit.x[A]
+    x, a = fit.x, fit.x[col.A]
     covariance = np.zeros((PARAMETERS, PARAMETERS))
     free = np.flatnonzero(fit.freedom.free)
     if free.size:
-        own = fit.noise_covariance
+        late = fit.x + fit.delay_std * (np.arange(PARAMETERS) == col.DELAY)
+        moved = fit.moved([fit.task.fitted(late)])  # the others make up for a delay that is off
+        own = fit.noise_covariance + moved.T @ moved
         if others:
-            moved = fit.moved(others)
+            moved = fit.under(others)
             own = own + moved.T @ moved / len(moved)
         covariance[np.ix_(free, free)] = own * np.outer(fit.scale, fit.scale)
     # to the power of the gain that each has in the table
-    power = BY_GAIN[:WITHIN] - 1.0 * (np.arange(WITHIN) == TIGHT)
-    values = x[:WITHIN] / a**power
-    turn = np.zeros((WITHIN, PARAMETERS))
-    turn[:, :WITHIN] = np.diag(fit.freedom.free[:WITHIN] / a**power)
-    turn[:, A] -= fit.freedom.free[:WITHIN] * power * values / a
-    values[A], turn[A] = 1.0 / a, 0.0
-    turn[A, A] = -1.0 / a**2
-    return values, turn @ covariance @ turn.T
+    power = BY_GAIN[: col.WITHIN] - 1.0 * (np.arange(col.WITHIN) == col.TIGHT)
+    values = x[: col.WITHIN] / a**power
+    turn = np.zeros((col.WITHIN, PARAMETERS))
+    turn[:, : col.WITHIN] = np.diag(fit.freedom.free[: col.WITHIN] / a**power)
+    turn[:, col.A] -= fit.freedom.free[: col.WITHIN] * power * values / a
+    values[col.A], turn[col.A] = 1.0 / a, 0.0
+    turn[col.A, col.A] = -1.0 / a**2
+    doubt, rubs = turn @ covariance @ turn.T, [col.STICKS, col.RUBS]
+    doubt[rubs, rubs] += (SHAPE * values[col.STICKS]) ** 2
+    return values, doubt
 
 
 def _servos(arm: _Arm, fits: Sequence[JointFit]) -> ServoModel:
     """The servos that the fits found."""
     x = np.array([fit.x for fit in fits])
-    kp = 1.0 / x[:, A]
-    lead, damping = x[:, LEAD], x[:, DAMPING]
+    kp = 1.0 / x[:, col.A]
+    lead, damping = x[:, col.LEAD], x[:, col.DAMPING]
     fed = lead > 0.0
     documented = arm.documented
     gain = np.where(fed, lead * kp, np.minimum(documented.velocity_gain, damping * kp))
     gain = np.where(~fed & (documented.velocity_gain == 0.0), damping * kp, gain)
     # what acts beside the torque's limit is friction, whoever makes it
-    gain = np.where(~fed & (x[:, TIGHT] > 0.0), x[:, WITHIN] * kp, gain)
+    gain = np.where(~fed & (x[:, col.TIGHT] > 0.0), x[:, col.WITHIN] * kp, gain)
     # A lead beyond all damping would be friction that drives: the damping is then all gain.
     return ServoModel(
         documented.joint_names,
         kp,
         gain,
-        x[:, RUBS] * kp,
+        x[:, col.RUBS] * kp,
         np.maximum(damping * kp - gain, 0.0),
-        x[:, INERTIA] * kp,
+        x[:, col.INERTIA] * kp,
         np.asarray(fed),
-        float(np.median(x[:, DELAY])),
+        float(np.median(x[:, col.DELAY])),
         arm.ground,
-        x[:, STICKS] * kp,
-        _limit(x[:, TIGHT], kp),
-        x[:, DEAD],
-        2.0 * x[:, PLAY],
+        x[:, col.STICKS] * kp,
+        np.divide(kp, x[:, col.TIGHT], out=np.full_like(kp, np.inf), where=x[:, col.TIGHT] > 0.0),
+        x[:, col.DEAD],
+        2.0 * x[:, col.PLAY],
+        np.where(x[:, col.STICKS] > 0.0, x[:, col.SLIPS], SLIP),
     )
-
-
-def _limit(tight: Array, kp: Array) -> Array:
-    with np.errstate(divide="ignore"):
-        return np.where(tight > 0.0, kp / tight, np.inf)
 
 
 def _scored(

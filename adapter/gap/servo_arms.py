@@ -25,7 +25,8 @@ class ServoNumber:
     Attributes:
         effect, joint: which, joints from 1 (0: of the whole arm).
         values, std: SI, by the arm's name, of those arms that have it.
-        usual: the arms' median; odd: arms that differ from it beyond both doubts and a tenth.
+        usual: the arms' median; unit: of them all.
+        odd: arms that differ from it beyond both doubts and a tenth.
     """
 
     effect: str
@@ -33,6 +34,7 @@ class ServoNumber:
     values: Mapping[str, float]
     std: Mapping[str, float]
     usual: float
+    unit: str
     odd: tuple[str, ...]
 
     @property
@@ -43,7 +45,7 @@ class ServoNumber:
 
     @property
     def _unit(self) -> tuple[float, str]:
-        return shown_unit(self.usual, EFFECTS[self.effect][2])
+        return shown_unit(self.usual, self.unit)
 
     def cell(self, arm: str) -> str:
         """Its value on an arm, with its doubt; a dash where it was not found."""
@@ -72,19 +74,22 @@ def beside(figures: Mapping[str, Any], own: str, others: Sequence[Path]) -> list
     Raises:
         UsageError: one is not such a result, or of an arm with other joints.
     """
-    found: dict[tuple[str, int], dict[str, tuple[float, float]]] = {}
+    found: dict[tuple[str, int, str], dict[str, tuple[float, float]]] = {}
     for name, result in [(own, figures), *((_name(x), _read(x, figures)) for x in others)]:
         name += "'" * sum(name in row for row in list(found.values())[:1])
         for finding in result["findings"]:
             key = EFFECTS[finding["effect"]][1]
+            unit = finding["units"][key]
             joints = [0] if finding["effect"] == "servo_delay" else finding["joints"]
             rows = zip(joints, finding["parameters"][key], finding["std"][key], strict=False)
             for joint, value, std in rows:
-                found.setdefault((finding["effect"], joint), {})[name] = value, std
+                found.setdefault((finding["effect"], joint, unit), {})[name] = value, std
     return [_number(*which, arms) for which, arms in sorted(found.items()) if len(arms) > 1]
 
 
-def _number(effect: str, joint: int, arms: Mapping[str, tuple[float, float]]) -> ServoNumber:
+def _number(
+    effect: str, joint: int, unit: str, arms: Mapping[str, tuple[float, float]]
+) -> ServoNumber:
     values = {name: float(value) for name, (value, _) in arms.items()}
     std = {name: float(doubt) for name, (_, doubt) in arms.items()}
     usual = float(np.median(list(values.values())))
@@ -95,7 +100,7 @@ def _number(effect: str, joint: int, arms: Mapping[str, tuple[float, float]]) ->
     for arm, value in values.items():
         least = max(SURE * float(np.hypot(std[arm], doubt)), LEAST_SHARE * abs(usual))
         odd += [arm] if far * abs(value - usual) > least else []
-    return ServoNumber(effect, joint, values, std, usual, tuple(odd))
+    return ServoNumber(effect, joint, values, std, usual, unit, tuple(odd))
 
 
 def _name(path: Path) -> str:

@@ -14,7 +14,6 @@ import numpy as np
 from adapter.effects.robots import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.phrases import numbered
-from adapter.gap.servo_kernels import SLIP
 from adapter.gap.servo_model import ServoModel
 from adapter.model.mjcf_drives import Drives, Floor, with_drives
 from adapter.model.self_model import SelfModel
@@ -54,7 +53,7 @@ def drives_of(servos: ServoModel, model: SelfModel) -> Drives:
         servos.feeds_speed,
         damping / (own_inertia + servos.armature),
         servos.stiction,
-        SLIP,
+        servos.slip,
         servos.delay_s,
         floor,
     )

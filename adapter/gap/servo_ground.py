@@ -8,7 +8,7 @@ of time that the fit has not seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -21,13 +21,13 @@ from adapter.gap.servo_fit import (
     LEAST,
     MILLI,
     NUDGE,
-    OUTLIER_RAD,
     JointTask,
     blocks,
     chi2_unit,
     first_guess,
     fit_joint,
     misfit,
+    robust_fit,
 )
 from adapter.gap.servo_kernels import DELAY, NO_GROUND, A, Ground
 from adapter.gap.servo_signals import over_ground
@@ -136,7 +136,7 @@ class _Together:
             for own, outside, rubs in ((least, -np.inf, 0.0), (most, np.inf, np.inf))
         ]
         z = np.clip(np.concatenate([y, (x[:, :PLAIN] / scale).ravel()]), *ends)
-        z, cost = robust_fit(left, slopes, z, ends, rounds)
+        z, cost = robust_fit(left, slopes, z, ends, (rounds, SETTLED), OWN)
         return z[:OWN], servos_of(z), cost
 
     def errors(self, ground: Ground, x: Array) -> Array:
@@ -145,50 +145,9 @@ class _Together:
         return np.array([misfit(task.fitted(own)) for task, own in pairs])
 
     def best_of(self, y: Array, servos: Sequence[Array]) -> Array:
-        """(n, 11) of several, joint by joint those that leave least."""
+        """(n, 12) of several, joint by joint those that leave least."""
         errors = np.array([self.errors(self.ground(y), x) for x in servos])
         return np.array(servos)[errors.argmin(axis=0), np.arange(self.arm.n)]
-
-
-def robust_fit(
-    left: Callable[[Array], Array],
-    slopes: Callable[[Array, Array], Array],
-    z: Array,
-    ends: Sequence[Array],
-    rounds: int,
-) -> tuple[Array, float]:
-    """Levenberg's and Marquardt's steps from z (k,), within both `ends`; also the cost.
-
-    The last `OWN` rows are of priors, which hold however far off they are: no outliers.
-
-    By products of the slopes' columns: scipy decomposes the whole of them at each step, which takes
-    ten times as long where there are 50 000 readings and 50 numbers.
-    """
-
-    def cost_of(rows: Array) -> float:
-        return misfit(rows[:-OWN] / MILLI) + float(np.sum((rows[-OWN:] / MILLI) ** 2))
-
-    rows, damping = left(z), 1e-3
-    cost = cost_of(rows)
-    for _ in range(rounds):
-        J, weight = slopes(z, rows), 1.0 / np.sqrt(1.0 + (rows / MILLI / OUTLIER_RAD) ** 2)
-        weight[-OWN:] = 1.0
-        G, g = J.T @ (weight[:, None] * J), J.T @ (weight * rows)
-        before = cost
-        while damping < 1e6:
-            free = ~(((z <= ends[0]) & (g > 0.0)) | ((z >= ends[1]) & (g < 0.0)))
-            H = G[np.ix_(free, free)]
-            step = np.zeros_like(z)
-            step[free] = np.linalg.solve(H + np.diag(damping * np.diagonal(H) + 1e-9), -g[free])
-            trial = np.clip(z + step, *ends)
-            moved = left(trial)
-            if (after := cost_of(moved)) < cost:
-                z, rows, cost, damping = trial, moved, after, damping / 5.0
-                break
-            damping *= 5.0
-        if before - cost < SETTLED * before:
-            break
-    return z, cost
 
 
 def _middles(tasks: Sequence[JointTask]) -> list[Array]:
@@ -206,10 +165,10 @@ def _beyond(arm: RigidArm, link: int, way_m: float) -> Array:
 def find_ground(
     arm: RigidArm, tasks: Sequence[JointTask], x: Array, tips: Sequence[Tip]
 ) -> tuple[Ground, Array]:
-    """What the hand comes down on (`NO_GROUND` if nothing pays), and the servos (n, 11) beside it.
+    """What the hand comes down on (`NO_GROUND` if nothing pays), and the servos (n, 12) beside it.
 
     Args:
-        tasks: of all joints, without ground; x: (n, 11) servos fitted without.
+        tasks: of all joints, without ground; x: (n, 12) servos fitted without.
         tips: documented, beyond which there is nothing: where there are some, nothing else touches.
     """
     found: list[tuple[float, _Together, Array, Array]] = []

@@ -7,7 +7,7 @@ scale that only the documented masses set):
 
 with a = 1 / kp, lead the fed-forward speed's gain over kp (s), damping (s) that of the velocity
 gain and viscous friction together, inertia the armature's (s²), and f = rubs + sticks max(0, 1 -
-|dq| / SLIP) dry friction: Coulomb's, and what it takes more to break a joint loose (rad).
+|dq| / slips) dry friction: Coulomb's, and what it takes more to break a joint loose (rad).
 A servo may drive nothing while its error is within `dead` (rad), and no harder than at an error of
 1 / tight (rad), the part `within` (s) of its damping included. A gear with backlash gives way to
 its load by `play` (rad), half of what it has: the motor, by which the servo steers, is ahead by it.
@@ -32,13 +32,13 @@ from adapter.physics.kernels import (
 )
 
 SWEEPS, SETTLED = 60, 1e-9  # of the joints' speeds in a step; rad/s
-# rad/s (or m/s) where a joint slides: Stribeck's curve as a line, which simulators can hold. It has
-# the area of one of 0.1, the upper end of published ones of gears; on a real arm unseen motions are
-# foretold as well with 0.1 to 0.3 as with a curve
+# rad/s (or m/s where a joint slides) at which nothing is left of it, where nobody says otherwise:
+# Stribeck's curve as a line, which simulators can hold. It has the area of one of 0.1, the upper
+# end of published ones of gears
 SLIP = 0.2
 
 # columns of a table of servos; the delay acts on commands, before all this
-A, LEAD, DAMPING, INERTIA, RUBS, DELAY, STICKS, TIGHT, DEAD, PLAY, WITHIN = range(11)
+A, LEAD, DAMPING, INERTIA, RUBS, DELAY, STICKS, TIGHT, DEAD, PLAY, SLIPS, WITHIN = range(12)
 LEAST_LOAD = 0.02  # N m, from which on a gear rests on one side of its play
 
 
@@ -185,13 +185,14 @@ def between(at, t, table, out):
 
 @jit
 def dry_friction(x, speed):
-    """Of a servo x (11,) at a speed, rad."""
-    return x[RUBS] + x[STICKS] * max(0.0, 1.0 - abs(speed) / SLIP)
+    """Of a servo x (12,) at a speed, rad."""
+    left = max(0.0, 1.0 - abs(speed) / x[SLIPS]) if x[STICKS] > 0.0 else 0.0
+    return x[RUBS] + x[STICKS] * left
 
 
 @jit
 def kept_back(x, error, moves, damps):
-    """What the drive of a servo x (11,) lacks, rad, in the mean of a step.
+    """What the drive of a servo x (12,) lacks, rad, in the mean of a step.
 
     Means over a straight way, so that edges within a step come out as they are.
 
@@ -221,7 +222,7 @@ def follow_alone(x, goal, load, start, step, q):
     """One joint under its commands, the others' motion known.
 
     Args:
-        x: (11,) the servo.
+        x: (12,) the servo.
         goal: (2, m) q_cmd, and lead dq_cmd, over each step, rad.
         load: `Load`; start: (2,) q, dq before the first step; step: s.
         q: (m,) rad after each step, filled.
@@ -260,7 +261,7 @@ def follow_together(x, goal, body, start, step, q):
     """All joints under their commands.
 
     Args:
-        x: (n, 11) the servos; goal: (2, m, n) as for one joint.
+        x: (n, 12) the servos; goal: (2, m, n) as for one joint.
         body: `Body`; start: (2, n) q, dq before the first step; step: s.
         q: (m, n) rad after each step, filled.
     """

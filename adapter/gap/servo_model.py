@@ -10,34 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from adapter.errors import ModelError
-from adapter.gap.servo_kernels import (
-    DAMPING,
-    DEAD,
-    DELAY,
-    INERTIA,
-    LEAD,
-    NO_GROUND,
-    PLAY,
-    RUBS,
-    STICKS,
-    TIGHT,
-    WITHIN,
-    A,
-    Body,
-    Ground,
-    follow_together,
-)
+from adapter.gap import servo_kernels as col
+from adapter.gap.servo_kernels import NO_GROUND, SLIP, Body, Ground, follow_together
 from adapter.gap.servo_signals import Track
+from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import base_at_rest
 from adapter.physics.rigid_arm import RigidArm
+from drivers.files.mcap import Commands, Log
 
 KEYS = ("position_gain", "velocity_gain", "coulomb", "viscous", "armature")
 # keys that a joint need not have, and what they are where there is none
-OTHERS = {"stiction": 0.0, "torque_limit": np.inf, "dead_band": 0.0, "backlash": 0.0}
+OTHERS = {"stiction": 0.0, "torque_limit": np.inf, "dead_band": 0.0, "backlash": 0.0, "slip": SLIP}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +41,7 @@ class ServoModel:
             Where it does not, velocity gain and viscous friction do the same: their sum counts.
         ground: what the hand comes down on, if anything.
         stiction: N m, by which breaking a joint loose takes more than Coulomb friction; it falls
-            in a line to nothing at `SLIP`.
+            in a line to nothing at `slip`, rad/s.
         torque_limit: N m, of what both gains ask for; dead_band: rad, of an error that drives
             nothing; backlash: rad, of the gear, from end to end, where servos steer by their
             motors and readings are of the links.
@@ -73,6 +60,7 @@ class ServoModel:
     torque_limit: Array = field(default_factory=lambda: np.array(np.inf))
     dead_band: Array = field(default_factory=lambda: np.zeros(()))
     backlash: Array = field(default_factory=lambda: np.zeros(()))
+    slip: Array = field(default_factory=lambda: np.array(SLIP))
 
     def __post_init__(self) -> None:
         for key in OTHERS:  # one number for all joints, too
@@ -92,19 +80,19 @@ class ServoModel:
         return bool(np.isinf(self.position_gain).any())
 
     def table(self) -> Array:
-        """(n, 11) as the compiled simulation takes it."""
-        x = np.zeros((len(self.joint_names), WITHIN + 1))
-        x[:, A] = 1.0 / self.position_gain
-        x[:, LEAD] = x[:, A] * self.velocity_gain * self.feeds_speed
-        x[:, DAMPING] = x[:, A] * (self.velocity_gain + self.viscous)
-        x[:, INERTIA] = x[:, A] * self.armature
-        x[:, RUBS] = x[:, A] * self.coulomb
-        x[:, STICKS] = x[:, A] * self.stiction
-        x[:, DELAY] = self.delay_s
+        """(n, 12) as the compiled simulation takes it."""
+        x = np.zeros((len(self.joint_names), col.WITHIN + 1))
+        x[:, col.A] = 1.0 / self.position_gain
+        x[:, col.LEAD] = x[:, col.A] * self.velocity_gain * self.feeds_speed
+        x[:, col.DAMPING] = x[:, col.A] * (self.velocity_gain + self.viscous)
+        x[:, col.INERTIA] = x[:, col.A] * self.armature
+        x[:, col.RUBS] = x[:, col.A] * self.coulomb
+        x[:, col.STICKS] = x[:, col.A] * self.stiction
+        x[:, col.DELAY], x[:, col.SLIPS] = self.delay_s, self.slip
         limited = np.isfinite(self.torque_limit)
-        x[limited, TIGHT] = self.position_gain[limited] / self.torque_limit[limited]
-        x[:, DEAD], x[:, PLAY] = self.dead_band, 0.5 * self.backlash
-        x[:, WITHIN] = x[:, A] * self.velocity_gain
+        x[limited, col.TIGHT] = self.position_gain[limited] / self.torque_limit[limited]
+        x[:, col.DEAD], x[:, col.PLAY] = self.dead_band, 0.5 * self.backlash
+        x[:, col.WITHIN] = x[:, col.A] * self.velocity_gain
         return x
 
     def follow(self, track: Track, arm: RigidArm) -> Array:
@@ -112,11 +100,24 @@ class ServoModel:
         if self.is_ideal:
             return track.commanded(self.delay_s)
         x = self.table()
-        goal = track.goal(x[:, LEAD], self.delay_s)
+        goal = track.goal(x[:, col.LEAD], self.delay_s)
         q = np.empty_like(goal[0])
         body = Body(arm.frames, arm.theta, base_at_rest(arm.gravity), self.ground)
         follow_together(x, goal, body, track.start, track.step_s, q)
         return q
+
+    def motion(self, model: SelfModel, time_s: ArrayLike, commands: ArrayLike) -> Array:
+        """(m, n) where an arm goes under commands (m, n), from rest at the first of them.
+
+        Args:
+            time_s: (m,) s, rising, of the commands, each held until the next.
+        """
+        goal, stamp_ns = np.asarray(commands, float), (1e9 * np.asarray(time_s)).astype(np.int64)
+        rests, unknown = np.tile(goal[:1], (len(goal), 1)), np.full_like(goal, np.nan)
+        orders, signals = Commands(stamp_ns, unknown, goal), (rests, unknown, unknown)
+        log = Log(Path("commands"), self.joint_names, stamp_ns, *signals, commands=orders)
+        track = Track.of(log)
+        return np.asarray(rests - track.left(self.follow(track, RigidArm.of(model))))
 
     def tracking_error(self, track: Track, arm: RigidArm) -> Array:
         """(n,) rad, rms of the measured positions less the simulated ones."""
@@ -132,12 +133,8 @@ class ServoModel:
         for j, name in enumerate(self.joint_names):
             quoted = name.replace("\\", "\\\\").replace('"', '\\"')
             lines += ["", "[[joint]]", f'name = "{quoted}"']
-            lines += [f"{key} = {float(getattr(self, key)[j]):.6g}" for key in KEYS]
-            lines += [
-                f"{key} = {float(getattr(self, key)[j]):.6g}"
-                for key, none in OTHERS.items()
-                if getattr(self, key)[j] != none
-            ]
+            own = {key: float(getattr(self, key)[j]) for key in (*KEYS, *OTHERS)}
+            lines += [f"{key} = {x:.6g}" for key, x in own.items() if x != OTHERS.get(key)]
             lines.append(f"feeds_speed = {str(bool(self.feeds_speed[j])).lower()}")
         if facts := ground_facts(self.ground, self.joint_names):
             told = "what the hand comes down on: behind which joint, where in that link's frame"
@@ -160,8 +157,9 @@ def ground_facts(ground: Ground, joint_names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
+def read_servos(path: str | Path, joint_names: tuple[str, ...]) -> ServoModel:
     """Servos from a file, in the arm's order of joints. Raises ModelError with what is wrong."""
+    path = Path(path)
     try:
         facts = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
@@ -183,17 +181,14 @@ def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
         raise ModelError(f"{path}: lacks the joints {', '.join(missing)}; it has {have}")
     servos = ServoModel.ideal(joint_names)
     rows = [told[name] for name in joint_names]
+    usual: dict[str, float | None] = {KEYS[0]: None, **dict.fromkeys(KEYS[1:], 0.0), **OTHERS}
     found: dict[str, Any] = {
-        key: np.array([_number(path, row, key, key == KEYS[0]) for row in rows]) for key in KEYS
+        key: np.array([_number(path, row, key, x) for row in rows]) for key, x in usual.items()
     }
-    for key, none in OTHERS.items():
-        found[key] = np.array(
-            [_number(path, row, key, none > 0.0) if key in row else none for row in rows]
-        )
     found["feeds_speed"] = np.array([bool(row.get("feeds_speed", False)) for row in rows])
     if "ground" in facts:
         found["ground"] = _ground(path, facts["ground"], joint_names)
-    return replace(servos, delay_s=_number(path, facts, "delay_s", False), **found)
+    return replace(servos, delay_s=_number(path, facts, "delay_s", 0.0), **found)
 
 
 def _ground(path: Path, facts: Any, joint_names: tuple[str, ...]) -> Ground:
@@ -213,10 +208,12 @@ def _ground(path: Path, facts: Any, joint_names: tuple[str, ...]) -> Ground:
     return Ground(link, point, up, height, float(np.sqrt(stiffness)), rubs)
 
 
-def _number(path: Path, row: Mapping[str, Any], key: str, needed: bool) -> float:
-    value = row.get(key, None if needed else 0.0)
+def _number(path: Path, row: Mapping[str, Any], key: str, usual: float | None) -> float:
+    if key not in row and usual is not None:
+        return usual
+    value = row.get(key)
     if not isinstance(value, int | float) or not np.isfinite(value) or value < 0.0:
         raise ModelError(f"{path}: {key} must be a number, 0 or more, got {value!r}")
-    if needed and value == 0.0:
+    if usual != 0.0 and value == 0.0:
         raise ModelError(f"{path}: {key} must be more than 0")
     return float(value)

@@ -8,22 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from adapter.gap.result import WORSE, RolloutCurves
+from adapter.gap import servo_kernels as col
+from adapter.gap.result import WORSE, InUnits, RolloutCurves
 from adapter.gap.servo_fit import JointFit
-from adapter.gap.servo_kernels import (
-    DAMPING,
-    DEAD,
-    INERTIA,
-    LEAD,
-    NO_GROUND,
-    PLAY,
-    RUBS,
-    STICKS,
-    TIGHT,
-    WITHIN,
-    A,
-    Ground,
-)
+from adapter.gap.servo_kernels import NO_GROUND, Ground
 from adapter.gap.servo_model import ServoModel
 from adapter.model.spatial import Array
 
@@ -32,7 +20,7 @@ DOCUMENTED_SHARE = 0.01  # of a documented value, to which it is meant; one stan
 SHOWN = 2.0  # from zero, where nobody documented a value: every servo has some of it
 OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
 
-EFFECTS = {  # what each is called, its parameter and its unit
+EFFECTS = {  # what each is called, its parameter and its unit, where a joint turns
     "servo_position_gain": ("position gain", "kp", "N m/rad"),
     "servo_velocity_gain": ("velocity gain", "kd", "N m s/rad"),
     "servo_delay": ("delay of commands", "d", "s"),
@@ -53,7 +41,7 @@ class ServoFinding:
     """One effect on some joints, whose number is not the documented one.
 
     Attributes:
-        effect: one of `EFFECTS`; joints: from 1.
+        effect: one of `EFFECTS`; joints: from 1, all turning or all sliding; unit: of its values.
         values, std, documented: one for each joint, SI; documented is None where nobody says.
         open: what cannot be told apart from it; empty where it stands alone.
     """
@@ -63,11 +51,12 @@ class ServoFinding:
     values: tuple[float, ...]
     std: tuple[float, ...]
     documented: tuple[float | None, ...]
+    unit: str
     open: str = ""
 
 
 @dataclass(frozen=True, eq=False)
-class ServoGap:
+class ServoGap(InUnits):
     """All that is said of a position-controlled arm.
 
     Attributes:
@@ -82,6 +71,7 @@ class ServoGap:
         ground: what the hand came down on beside what is documented, if anything; touched: for how
             long, s, in each recording that is fitted.
         notes: a sentence each.
+        slides: (n,) whether each joint does: its figures are then in N and m.
     """
 
     joint_names: tuple[str, ...]
@@ -98,6 +88,7 @@ class ServoGap:
     ground: Ground = NO_GROUND
     touched: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+    slides: tuple[bool, ...] = ()
 
     @cached_property
     def before(self) -> Array:
@@ -120,13 +111,13 @@ def rms(left: Sequence[Array]) -> Array:
     return np.asarray(np.sqrt(np.mean([np.mean(x**2, axis=0) for x in left], axis=0)))
 
 
-class Findings:
+class Findings(InUnits):
     """Findings as they come, joint by joint."""
 
-    def __init__(self, documented: ServoModel) -> None:
-        self.docs = documented
+    def __init__(self, documented: ServoModel, slides: tuple[bool, ...]) -> None:
+        self.docs, self.slides = documented, slides
         self.rows: dict[str, list[tuple[int, float, float, float | None]]] = {
-            e: [] for e in EFFECTS
+            x: [] for x in EFFECTS
         }
         self.together = False
         self.scale_open: list[int] = []
@@ -141,7 +132,7 @@ class Findings:
             row = j + 1, float(value), float(std), float(documented) if told else None
             self.rows[effect].append(row)
         else:
-            title, _, unit = EFFECTS[effect]
+            title, unit = EFFECTS[effect][0], self.unit(EFFECTS[effect][2], j)
             self.notes.append(
                 f"joint {j + 1}: {title} of {value:.3g} {unit} is in the model and not named: "
                 "inertias as wrong as they may be explain as much"
@@ -152,42 +143,43 @@ class Findings:
         docs, free = self.docs, fit.freedom.free
         values, std = fit.values, np.sqrt(np.diagonal(fit.doubt))
         gain = float(docs.velocity_gain[j])
-        if free[A]:
+        if free[col.A]:
             self.add("servo_position_gain", j, values[0], std[0], float(docs.position_gain[j]))
             if std[0] > OPEN_SHARE * values[0]:
                 self.scale_open.append(j + 1)
-        if free[LEAD]:
+        if free[col.LEAD]:
             self.add("servo_velocity_gain", j, values[1], std[1], gain)
-        if fit.x[LEAD] > 0.0 and (free[LEAD] or free[DAMPING]):
-            apart = np.eye(WITHIN)[DAMPING] - np.eye(WITHIN)[LEAD]
+        if fit.x[col.LEAD] > 0.0 and (free[col.LEAD] or free[col.DAMPING]):
+            apart = np.eye(col.WITHIN)[col.DAMPING] - np.eye(col.WITHIN)[col.LEAD]
             doubt = float(np.sqrt(apart @ fit.doubt @ apart))
             self.add("viscous_friction", j, float(apart @ values), doubt, float(docs.viscous[j]))
-        elif free[DAMPING] and gain > 0.0:
+        elif free[col.DAMPING] and gain > 0.0:
             self.add("viscous_friction", j, values[2] - gain, std[2], float(docs.viscous[j]))
-        elif free[DAMPING]:
+        elif free[col.DAMPING]:
             self.together = True
             self.add("servo_velocity_gain", j, values[2], std[2], gain)
-        if free[INERTIA]:
-            self.add("motor_inertia", j, values[3], std[3], float(docs.armature[j]))
-        if free[RUBS]:
-            self.add("coulomb_friction", j, values[4], std[4], float(docs.coulomb[j]))
-        if free[STICKS]:
-            self.add("static_friction", j, values[STICKS], std[STICKS], float(docs.stiction[j]))
-        if free[TIGHT] and values[TIGHT] > 0.0:
-            limit, off = 1.0 / values[TIGHT], std[TIGHT] / values[TIGHT] ** 2
+        if free[col.TIGHT] and values[col.TIGHT] > 0.0:
+            limit, off = 1.0 / values[col.TIGHT], std[col.TIGHT] / values[col.TIGHT] ** 2
             self.add("servo_torque_limit", j, limit, off, float(docs.torque_limit[j]))
-        if free[DEAD]:
-            self.add("servo_dead_band", j, values[DEAD], std[DEAD], float(docs.dead_band[j]))
-        if free[PLAY]:
-            self.add("backlash", j, 2 * values[PLAY], 2 * std[PLAY], float(docs.backlash[j]))
+        for effect, k, times, told in (
+            ("motor_inertia", col.INERTIA, 1.0, docs.armature),
+            ("coulomb_friction", col.RUBS, 1.0, docs.coulomb),
+            ("static_friction", col.STICKS, 1.0, docs.stiction),
+            ("servo_dead_band", col.DEAD, 1.0, docs.dead_band),
+            ("backlash", col.PLAY, 2.0, docs.backlash),
+        ):
+            if free[k]:
+                self.add(effect, j, times * values[k], times * std[k], float(told[j]))
 
     def findings(self) -> tuple[ServoFinding, ...]:
-        """By effect."""
+        """By effect and unit."""
         found = []
         for effect, entries in self.rows.items():
-            if entries:
-                joints, values, stds, documented = zip(*entries, strict=True)
-                both = self.together and effect == "servo_velocity_gain"
-                said = WITH_FRICTION if both else ""
-                found.append(ServoFinding(effect, joints, values, stds, documented, said))
+            both = self.together and effect == "servo_velocity_gain"
+            said = WITH_FRICTION if both else ""
+            units = [self.unit(EFFECTS[effect][2], row[0] - 1) for row in entries]
+            for unit in dict.fromkeys(units):
+                own = [row for row, its in zip(entries, units, strict=True) if its == unit]
+                joints, values, stds, documented = zip(*own, strict=True)
+                found.append(ServoFinding(effect, joints, values, stds, documented, unit, said))
         return tuple(found)

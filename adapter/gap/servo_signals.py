@@ -131,7 +131,8 @@ def columns(at: Array, t: Array, table: Array) -> Array:
 def smoothed(q: Array, step_s: float, period_s: float) -> Array:
     """(3, m, n) q, dq, ddq through a zero-phase low-pass."""
     cut = min(CUT_HZ, CUT_SHARE / period_s)
-    clean = sosfiltfilt(butter(4, cut, fs=1.0 / step_s, output="sos"), q, axis=0)
+    sections, pad = butter(4, cut, fs=1.0 / step_s, output="sos"), min(15, len(q) - 1)
+    clean = sosfiltfilt(sections, q, axis=0, padlen=pad)
     dq = np.gradient(clean, step_s, axis=0)
     return np.array([clean, dq, np.gradient(dq, step_s, axis=0)])
 

@@ -11,12 +11,15 @@ from adapter.gap.servo_model import ground_facts
 from adapter.gap.servo_result import EFFECTS, ServoFinding, ServoGap
 from adapter.model.numbers import plain, plus_minus
 
-LABEL = 31  # columns of a figure's name
-
 
 def headline(gap: ServoGap) -> str:
     """The outcome in one sentence."""
-    before, after = (f"{plain(1e3 * float(x.max()), 2)} mrad" for x in (gap.before, gap.after))
+    units = [gap.unit("mrad", j) for j in range(len(gap.joint_names))]
+    kinds = {u: [j for j, own in enumerate(units) if own == u] for u in sorted({*units})[::-1]}
+    before, after = (  # of joints that turn, and of those that slide
+        " and ".join(f"{plain(1e3 * float(x[j].max()), 2)} {u}" for u, j in kinds.items())
+        for x in (gap.before, gap.after)
+    )
     if not gap.findings and gap.ground.root == 0.0:
         return f"the arm does what its servos' documentation says: tracking as foretold to {before}"
     parts = [_short(finding) for finding in gap.findings]
@@ -58,7 +61,7 @@ def _short(finding: ServoFinding) -> str:
     joints = f"joint{'s' if len(finding.joints) > 1 else ''} {numbered(finding.joints)}"
     if finding.effect == "servo_delay":
         return f"commands act {1e3 * finding.values[0]:.2f} ms late"
-    factor, unit = shown_unit(finding.values[0], EFFECTS[finding.effect][2])
+    factor, unit = shown_unit(finding.values[0], finding.unit)
     values = listed([plain(factor * value, 3) for value in finding.values])
     known = any(value is not None for value in finding.documented)
     than = " is not as documented" if known else ""
@@ -71,7 +74,7 @@ def lines(gap: ServoGap) -> list[str]:
     for finding in gap.findings:
         found.append(f"[green]•[/green] {escape(EFFECTS[finding.effect][0])}")
         rows = zip(finding.joints, finding.values, finding.std, finding.documented, strict=True)
-        factor, unit = shown_unit(finding.values[0], EFFECTS[finding.effect][2])
+        factor, unit = shown_unit(finding.values[0], finding.unit)
         for j, value, std, documented in rows:
             known = "" if documented is None else f", documented {plain(factor * documented, 4)}"
             said = f"{plus_minus(factor * value, factor * std)} {unit}{known}"
@@ -86,14 +89,16 @@ def lines(gap: ServoGap) -> list[str]:
             f"[yellow]?[/yellow] joint {which}: the documented masses hardly load it, so that its "
             "gains, friction and inertia are known but for a common factor"
         )
+    errors = {
+        f"tracking error before, {gap.unit('mrad')}": gap.before,
+        f"               after, {gap.unit('mrad')}": gap.after,
+        "at the hand before, mm, and all": gap.hand_before,
+        "            after, mm, and all": gap.hand_after,
+    }
+    wide = max(map(len, errors))
     found += [
-        f"{name:<{LABEL}} " + " ".join(f"{plain(1e3 * x, 3):>7}" for x in error)
-        for name, error in (
-            ("tracking error before, mrad", gap.before),
-            ("               after, mrad", gap.after),
-            ("at the hand before, mm, and all", gap.hand_before),
-            ("            after, mm, and all", gap.hand_after),
-        )
+        f"{name:<{wide}} " + " ".join(f"{plain(1e3 * x, 3):>7}" for x in error)
+        for name, error in errors.items()
     ]
     return found + [f"[dim]note[/dim] {escape(text)}" for text in gap.notes]
 
@@ -102,14 +107,14 @@ def as_json(gap: ServoGap) -> dict[str, Any]:
     """What the JSON file holds."""
     findings = []
     for f in gap.findings:
-        _, key, unit = EFFECTS[f.effect]
+        key = EFFECTS[f.effect][1]
         findings.append(
             {
                 "effect": f.effect,
                 "joints": f.joints,
                 "parameters": {key: f.values},
                 "std": {key: f.std},
-                "units": {key: unit},
+                "units": {key: f.unit},
                 "documented": {key: f.documented},
                 "not_told_apart": f.open or None,
             }
@@ -117,6 +122,7 @@ def as_json(gap: ServoGap) -> dict[str, Any]:
     return {
         "headline": headline(gap),
         "joint_names": gap.joint_names,
+        "slides": gap.slides,
         "model": gap.model_name,
         "recordings": gap.recordings,
         "findings": findings,

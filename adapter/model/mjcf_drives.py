@@ -72,7 +72,7 @@ class Drives:
     feeds_speed: NDArray[np.bool_]
     quickness: Array
     static: Array
-    slip: float
+    slip: Array
     delay_s: float = 0.0
     floor: Floor | None = None
 
@@ -174,7 +174,7 @@ class _Writer:
                 most = float(drives.static[k])
                 eases: dict[str, Any] = {"name": name + SLIDES, "joint": name, "biastype": "affine"}
                 # MuJoCo takes a positive third number for a damping ratio beside equal others
-                eases |= {"gainprm": 0, "biasprm": [0.0, UNEQUAL, most / drives.slip]}
+                eases |= {"gainprm": 0, "biasprm": [0.0, UNEQUAL, most / float(drives.slip[k])]}
                 more.append(_element("general", eases | {"forcerange": [-most, most]}))
         for number, key in enumerate(x for x in self.there if x.tag == "key"):
             if "ctrl" in key.attributes:  # one number for each actuator

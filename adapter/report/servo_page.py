@@ -40,7 +40,7 @@ def render_servo_page(
     parts.sort(key=lambda text: not text.startswith("tracking error"))
     panels = []
     for what, factor, unit, (before, after) in (
-        ("Tracking error", 1e3, "mrad rms", (gap.before, gap.after)),
+        ("Tracking error", 1e3, f"{gap.unit('mrad')} rms", (gap.before, gap.after)),
         ("At the hand", 1e3, "mm rms", (gap.hand_before[:-1], gap.hand_after[:-1])),
     ):
         drawing = fall_drawing(factor * before, factor * after, None, joints)
@@ -77,7 +77,7 @@ def render_servo_page(
 
 def _tiles(gap: ServoGap) -> list[Tile]:
     j = int(np.argmax(gap.before))
-    off = arrow(1e3 * gap.before[j], 1e3 * gap.after[j], "mrad")
+    off = arrow(1e3 * gap.before[j], 1e3 * gap.after[j], gap.unit("mrad", j))
     at_hand = arrow(1e3 * gap.hand_before[-1], 1e3 * gap.hand_after[-1], "mm")
     numbers = str(sum(len(f.joints) for f in gap.findings if f.effect != "servo_delay"))
     late = [f for f in gap.findings if f.effect == "servo_delay"]
@@ -90,8 +90,8 @@ def _found(gap: ServoGap) -> Table | None:
     """Findings, a row for each joint and a column for each effect."""
     columns = [("Joint", "", [f"{j} {name}" for j, name in enumerate(gap.joint_names, start=1)])]
     for finding in gap.findings:
-        title, _, unit = EFFECTS[finding.effect]
-        factor, shown = shown_unit(finding.values[0], unit)
+        title = EFFECTS[finding.effect][0]
+        factor, shown = shown_unit(finding.values[0], finding.unit)
         cells = [DASH] * len(gap.joint_names)
         rows = zip(finding.values, finding.std, finding.documented, strict=True)
         for j, (value, std, documented) in zip(finding.joints, rows, strict=True):
@@ -108,7 +108,7 @@ def _errors(gap: ServoGap) -> Table:
     rows = [[name, *row] for name, row in zip(gap.joint_names, cells, strict=True)]
     rows.append(["all", DASH, DASH, *(plain(1e3 * x[-1], 3) for x in hand)])
     heads = ["Joint", "Before", "After", "Before", "After"]
-    return Table(heads, rows, ["", "mrad", "mrad", "hand, mm", "hand, mm"])
+    return Table(heads, rows, ["", *[gap.unit("mrad")] * 2, "hand, mm", "hand, mm"])
 
 
 def _arms(numbers: Sequence[ServoNumber]) -> Table | None:
@@ -130,7 +130,7 @@ def _moments(gap: ServoGap) -> list[Panel]:
             each.append((float(np.sum(left[inside] ** 2)), name, x, (start, stop)))
         _, name, x, span = max(each, key=lambda one: one[0])
         title = f"Joint {j + 1}, {gap.joint_names[j]}"
-        panels.append(rollout_drawing(x, j, *span).panel(title, "rad", f"of {name}"))
+        panels.append(rollout_drawing(x, j, *span).panel(title, gap.unit("rad", j), f"of {name}"))
     return panels
 
 
@@ -145,9 +145,10 @@ def _checks(gap: ServoGap) -> list[Check]:
     lost = f"; {who('', gap.worse)}: not better" if gap.worse else ""
     checks = [Check(LOOK if gap.worse else GOOD, "On data not fitted", said + lost)]
     left = [j + 1 for j in _unexplained(gap)]
-    said = f"every joint is below a quarter of its error or below {CLOSE_MRAD:g} mrad"
+    close = f"{CLOSE_MRAD:g} {gap.unit('mrad')}"
+    said = f"every joint is below a quarter of its error or below {close}"
     if left:
-        said = f"{who('', left)}: more than a quarter of the error and {CLOSE_MRAD:g} mrad"
+        said = f"{who('', left)}: more than a quarter of the error and {close}"
         said += " that no number of these servos explains"
     checks.append(Check(LOOK if left else GOOD, "What is left", said))
     if gap.scale_open:

@@ -25,10 +25,9 @@ from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_signals import Track
 from adapter.gap.servo_words import headline
 from adapter.physics.rigid_arm import RigidArm
+from adapter.report.servo_page import CLOSE_MRAD, SHARE
 from drivers.files.mcap import read_position_log
 from tests.helpers.position_mujoco import error_in_mujoco
-
-SHARE, CLOSE_MRAD = 0.25, 4.0
 
 
 def main() -> None:

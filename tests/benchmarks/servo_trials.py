@@ -44,19 +44,14 @@ def main() -> None:
             off = errors(gap, arm)
             worst = {effect: np.abs(error).max() for effect, error in off.items()}
             within = sum(int((np.abs(error) < 0.1).sum()) for error in off.values())
-            rows.append(
-                (
-                    drawn.masses_off > 0.0,
-                    len(named(gap) & arm.expected),
-                    len(arm.expected),
-                    len(named(gap) - arm.expected),
-                    within,
-                    float(gap.before.max()),
-                    float(gap.after.max()),
-                    len(null.findings),
-                    float(there.max()),
-                )
+            names = (
+                len(named(gap) & arm.expected),
+                len(arm.expected),
+                len(named(gap) - arm.expected),
             )
+            motion = float(gap.before.max()), float(gap.after.max())
+            last = len(null.findings), float(there.max())
+            rows.append((drawn.masses_off > 0.0, *names, within, *motion, *last))
             write(args.json, rows)
             told = ", ".join(f"{e} {100.0 * x:.1f} %" for e, x in worst.items())
             print(

@@ -20,7 +20,7 @@ from tests.helpers.pages import (
 DRAWN = "figures/"  # when the site is built, by docs/site/figures.py
 # What a block of Python in a page calls, and so which test of test_commands.py runs it
 CALLS = ("adapter.learn(", "find_gap", "MujocoArm", "SnapshotReader", "hour.mcap", "AnyReader")
-RUN = (*CALLS, "adapter.Told(", "from_xml_path(")  # the last: test_servo_hour.py
+RUN = (*CALLS, "adapter.Told(", "from_xml_path(", "read_servos(")  # the last: test_servo_hour.py
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -46,5 +46,6 @@ def test_from_a_data_set_to_a_simulated_arm(
     exec(blocks("python", PAGE)[0], names)
     data, goal = names["data"], np.clip(names["goals"][-1], *names["model"].jnt_range.T)
     assert data.time == pytest.approx(1.0)
-    off = np.abs(data.qpos - goal)
-    assert 1e-4 < off.max() < 0.1
+    assert 1e-4 < np.abs(data.qpos - goal).max() < 0.1
+    exec(next(x for x in blocks("python", "docs/python.md") if "read_servos(" in x), names)
+    assert 1e-4 < np.abs(names["q"] - names["goals"]).max() < 0.1

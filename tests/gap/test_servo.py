@@ -13,7 +13,7 @@ from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import ModelError
 from adapter.gap.servo import explain
-from adapter.gap.servo_kernels import SLIP, STICKS, WITHIN, Ground, Load, follow_alone
+from adapter.gap.servo_kernels import SLIP, SLIPS, STICKS, WITHIN, Ground, Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
 from adapter.gap.servo_signals import Track, columns, loads, over_ground
 from adapter.gap.servo_words import headline
@@ -71,7 +71,7 @@ def test_what_limits_a_servo_is_named(effect, key, joints, size) -> None:
     told = {name for name in named(gap) if name[0] == effect}
     assert told == {(effect, j) for j in joints}
     assert named(gap) <= arm.expected
-    assert np.abs(errors(gap, arm)[effect]).max() < 0.05
+    assert np.abs(errors(gap, arm)[effect]).max() < 0.1
     assert (gap.after < 1e-3).all() and (gap.after < 0.2 * gap.before).all()
 
 
@@ -129,7 +129,7 @@ def test_an_arm_that_is_where_its_commands_are_has_nothing_named() -> None:
 
 
 def servo(*numbers: float) -> Array:
-    """(11,) of which the first are told."""
+    """(12,) of which the first are told."""
     return np.pad(np.array(numbers), (0, WITHIN + 1 - len(numbers)))
 
 
@@ -162,22 +162,14 @@ def test_a_table_is_read_between_its_rows() -> None:
         assert np.abs(columns(at, t, table) - right).max() < 1e-12
 
 
-def test_friction_holds_a_joint() -> None:
-    """A step smaller than what friction holds moves nothing; a larger one stops short of it."""
-    x, m, q = servo(0.0, 0.0, 0.05, 1e-4, 0.01), 5000, np.empty(5000)
-    load = Load(*np.zeros((6, m)))
-    follow_alone(x, steers(np.full(m, 0.009)), load, np.zeros(2), 1e-3, q)
-    assert not q.any()
-    follow_alone(x, steers(np.full(m, 0.05)), load, np.zeros(2), 1e-3, q)
-    assert 0.04 - 1e-4 <= q[-1] <= 0.06
-    assert np.ptp(q[-100:]) == 0.0
-
-
-def test_friction_falls_as_a_joint_slides() -> None:
-    """Pulled along at a speed, it lags by Coulomb friction and what of the static one is left."""
+def test_friction_holds_a_joint_and_falls_as_it_slides() -> None:
+    """A step smaller than what friction holds moves nothing, a larger one stops short of it; pulled
+    along at a speed, it lags by Coulomb friction and what of the static one is left."""
     m, step, q = 4000, 1e-3, np.empty(4000)
     x, load = servo(0.0, 0.0, 0.3, 1e-4, 0.01), Load(*np.zeros((6, m)))
-    x[STICKS] = 0.006
+    x[STICKS], x[SLIPS] = 0.006, SLIP
+    follow_alone(x, steers(np.full(m, 0.05)), load, np.zeros(2), step, q)
+    assert abs(q[-1] - 0.034) < 1e-6
     follow_alone(x, steers(np.full(m, 0.0159)), load, np.zeros(2), step, q)
     assert not q.any()
     for speed in (0.05, 0.1, 0.3):
@@ -248,15 +240,7 @@ def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -
     asked = [*words, "--hold-out", str(unseen), "--out", str(tmp_path / "one")]
     assert main(asked) == 0
     said = capsys.readouterr().out
-    for part in (
-        "position gain",
-        "velocity gain",
-        "ms late",
-        "Coulomb",
-        "viscous",
-        "inertia",
-        "at the hand",
-    ):
+    for part in ("position gain", "velocity gain", "ms late", "Coulomb", "viscous", "inertia"):
         assert part in said
     figures = json.loads((tmp_path / "one" / "gap.json").read_text())
     assert max(figures["after"]["tracking_rmse_rad"]) < 1e-4
@@ -290,14 +274,8 @@ def test_what_does_not_belong_to_such_a_recording_is_refused(recorded, tmp_path,
 
 def test_a_recording_too_short_or_at_rest_is_refused() -> None:
     recording = position_arm(24, Drawn(6.0)).moved("sines", 24)
-    short = replace(
-        recording,
-        stamp_ns=recording.stamp_ns[:500],
-        q=recording.q[:500],
-        q_command=recording.q_command[:500],
-    )
     with pytest.raises(RecordingRefused, match="better 20 s"):
-        explain([as_log(short)], PANDA)
+        explain([as_log(recording).piece(0, 500)], PANDA)
     rests = replace(recording, q=np.tile(recording.q[:1], (len(recording.q), 1)))
     with pytest.raises(RecordingRefused, match="too little motion"):
         explain([as_log(rests)], PANDA)
@@ -327,6 +305,7 @@ def test_a_servo_file_comes_back(tmp_path: Path) -> None:
     servos = position_arm(25).documentation
     ground = Ground(6, np.array([0.0, 0.01, 0.1]), np.array([0.0, 0.0, 1.0]), -0.02, 20.0)
     limits = {"stiction": 0.2, "torque_limit": 9.5, "dead_band": 2e-3, "backlash": 4e-3}
+    limits["slip"] = 0.1
     servos = replace(servos, ground=ground, **{key: np.array(x) for key, x in limits.items()})
     servos.save(tmp_path / "servo.toml")
     back = read_servos(tmp_path / "servo.toml", servos.joint_names)
@@ -336,4 +315,4 @@ def test_a_servo_file_comes_back(tmp_path: Path) -> None:
     assert back.delay_s == servos.delay_s
     assert back.ground.link == ground.link
     assert np.allclose(np.hstack(back.ground[1:]), np.hstack(ground[1:]))
-    assert not ServoModel.ideal(("a",)).table().any()
+    assert not np.delete(ServoModel.ideal(("a",)).table(), SLIPS).any()

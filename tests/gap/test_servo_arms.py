@@ -21,13 +21,14 @@ JOINTS = ["a", "b", "c"]
 def result(rng: np.random.Generator, odd: float = 1.0) -> dict[str, Any]:
     """Figures of an arm whose numbers are true but for their doubt; `odd` times gain of joint b."""
     findings = []
-    for number, (effect, (_, key, _)) in enumerate(EFFECTS.items()):
+    for number, (effect, (_, key, unit)) in enumerate(EFFECTS.items()):
         true = (1.0 + number) * np.array([1.0, 2.0, 3.0])
         if number == 0:
             true[1] *= odd
         std = 0.01 * true * rng.uniform(0.5, 2.0, 3)
         values = true + std * rng.standard_normal(3)
         facts = {"parameters": {key: values.tolist()}, "std": {key: std.tolist()}}
+        facts["units"] = {key: unit}
         findings.append({"effect": effect, "joints": [1, 2, 3], **facts})
     return {"joint_names": JOINTS, "findings": findings, "after": {"tracking_rmse_rad": [0.0] * 3}}
 

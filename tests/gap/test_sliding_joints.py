@@ -14,9 +14,11 @@ import pytest
 
 import adapter
 from adapter.cli import main
+from adapter.gap import servo_words
 from adapter.gap.load import find_load
-from adapter.gap.servo import going_on
+from adapter.gap.servo import explain, going_on
 from adapter.gap.servo_kernels import Ground, over_ground
+from adapter.gap.servo_model import ServoModel, read_servos
 from adapter.gap.words import console_summary, headline
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
@@ -138,6 +140,24 @@ def test_fingers_in_a_recording_are_spoken_of_and_free_where_asked_for() -> None
     left = (log.tau - found)[5:-5, 4]
     friction = COULOMB_N * np.sign(log.dq[5:-5, 4]) + VISCOUS_N_S * log.dq[5:-5, 4]
     assert np.corrcoef(left, friction)[0, 1] > 0.98
+
+
+def test_a_servo_that_slides_is_told_in_newtons_and_metres(tmp_path: Path) -> None:
+    model, driven = recorded("scara", False)
+    names, t = model.tree.joint_names, 1e-9 * (driven.stamp_ns - driven.stamp_ns[0])
+    kp, kd = np.array([300.0, 200.0, 4e3, 20.0]), np.array([12.0, 8.0, 160.0, 0.8])
+    others = 2e-3 * kp, 0.0 * kp, 2e-3 * kp, kp < 0.0, 4e-3
+    ServoModel(names, kp, kd, *others).save(file := tmp_path / "servo.toml")
+    q = read_servos(file, names).motion(model, t, driven.q)
+    read = q + 2e-5 * np.random.default_rng(4).normal(size=q.shape)
+    orders = Commands(driven.stamp_ns, np.full_like(q, np.nan), driven.q)
+    found = explain([replace(driven, q=read, commands=orders)], model)
+    gains = {f.unit: f for f in found.findings if f.effect == "servo_position_gain"}
+    assert gains["N/m"].joints == (3,) and gains["N m/rad"].joints == (1, 2, 4)
+    assert gains["N/m"].values[0] == pytest.approx(kp[2], rel=0.05)
+    said = " ".join(servo_words.lines(found))
+    own = r"position gain of joint 3: [\d.]+ N/m.*worst joint [\d.]+ mrad and [\d.]+ mm -> "
+    assert re.search(own + r".*tracking error before, mrad \(mm of joint 3\)", said)
 
 
 @pytest.mark.parametrize("robot", ["rail", "scara", "gantry"])

@@ -33,10 +33,10 @@ def found() -> ServoGap:
     documented = None, 14.0, None
     findings = (
         ServoFinding(
-            "servo_position_gain", (1, 2, 3), (10.0, 12.0, 3.0), (0.1, 0.2, 2.0), documented
+            "servo_position_gain", (1, 2, 3), (10.0, 12.0, 3.0), (0.1, 0.2, 2.0), documented, "N m"
         ),
-        ServoFinding("servo_velocity_gain", (2,), (0.8,), (0.02,), (None,), WITH_FRICTION),
-        ServoFinding("servo_delay", (1, 2, 3), (3e-3,) * 3, (1e-4,) * 3, (0.0,) * 3),
+        ServoFinding("servo_velocity_gain", (2,), (0.8,), (0.02,), (None,), "N m s", WITH_FRICTION),
+        ServoFinding("servo_delay", (1, 2, 3), (3e-3,) * 3, (1e-4,) * 3, (0.0,) * 3, "s"),
     )
     return ServoGap(
         NAMES,
@@ -76,6 +76,9 @@ def test_the_page_says_what_was_found_and_what_to_do() -> None:
     ):  # fmt: skip
         assert part in said.replace("\u202f", " ").replace("\u00a0", " "), part
     assert "<h1>Tracking error of the worst joint" in page
+    sliding = replace(found(), slides=(False, False, True))
+    of_it = text_of(render_servo_page(sliding, "arm", Path("x.toml")))
+    assert "Joint 3, jaw m " in of_it and "mrad (mm of joint 3) rms" in of_it
     assert said.index("Joint 3, jaw") < said.index("Joint 2, lift") < said.index("Joint 1, pan")
 
 
