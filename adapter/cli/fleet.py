@@ -50,8 +50,15 @@ def run(args: argparse.Namespace) -> int:
         path = save_model(arm.model, folder / f"{name}.json")
         write_urdf(arm.model, path.with_suffix(".urdf"), f"{arm.name}: ")
         names["model"] = str(path)
-        if not args.quiet:
-            _print(arm)
+        if args.quiet:
+            continue
+        shown = fleet_page.to_be_shown(arm, 40)  # of more, those that there is something to say of
+        heads = [Column(x, no_wrap=k > 0, overflow="fold") for k, x in enumerate(fleet_page.HEADS)]
+        print_table(heads, fleet_page.log_rows(arm, shown), title=arm.name, title_justify="left")
+        if len(shown) < len(arm.logs):
+            show(f"{len(arm.logs) - len(shown)} recordings of which nothing is to be said")
+        for line in fleet_page.sentences(arm):
+            show(line)
     for line in fleet_page.summary(found):
         show(line)
     figures["table"] = str(_write_table(found, folder))
@@ -94,7 +101,7 @@ def _write_table(found: fleet.Fleet, folder: Path) -> Path:
 
 def _row(arm: FleetArm, number: int) -> dict[str, Any]:
     log = arm.logs[number]
-    taken, load = log.moments, log.load
+    load = log.load
     out = [f"{x.effect}_{x.joint}" for x in arm.standing_out if x.number == number]
     by_joint = {f"rmse_nm_{j}": float(x) for j, x in enumerate(log.rmse, start=1)}
     for k, name in enumerate(arm.effects):
@@ -102,14 +109,11 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
             by_joint[f"{name}_{j + 1}"] = float(log.effects[k, j])
             by_joint[f"{name}_std_{j + 1}"] = float(log.effects_std[k, j])
     return {
-        "log": taken.path,
+        "log": log.moments.path,
         "state": "used" if log.used else "disagrees",
         "why": None,
         "arm": arm.name,
-        "content": taken.content,
-        "begin_s": taken.begin_s,
-        "span_s": taken.span_s,
-        "samples": taken.samples,
+        **{key: getattr(log.moments, key) for key in ("content", "begin_s", "span_s", "samples")},
         "load_kg": None if load is None else load.mass,
         "load_std_kg": None if load is None else load.std,
         "disagrees": " ".join(map(str, log.disagrees)),
@@ -117,13 +121,3 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
         "worth_nats": log.worth,
         **by_joint,
     }
-
-
-def _print(arm: FleetArm) -> None:
-    shown = fleet_page.to_be_shown(arm, 40)  # of more, those that there is something to say of
-    heads = [Column(x, no_wrap=k > 0, overflow="fold") for k, x in enumerate(fleet_page.HEADS)]
-    print_table(heads, fleet_page.log_rows(arm, shown), title=arm.name, title_justify="left")
-    if len(shown) < len(arm.logs):
-        show(f"{len(arm.logs) - len(shown)} recordings of which nothing is to be said")
-    for line in fleet_page.sentences(arm):
-        show(line)

@@ -70,7 +70,13 @@ def _run(args: argparse.Namespace) -> int:
     for new in (model_out, model_out.with_suffix(".urdf")):  # never over the one it comes from
         if new.exists() and Path(args.model).exists() and new.samefile(args.model):
             raise UsageError(f"--out {folder} would overwrite {args.model}; give another folder")
-    rollouts = _rollouts(args)
+    rollouts: Rollouts | None = None
+    try:
+        rollouts = None if args.no_simulation else Rollouts(args.simulator or "pybullet")
+    except MeansError as error:
+        if args.simulator is not None:
+            raise
+        terminal.warn([f"torques are compared, and nothing is simulated: {error}"])
     try:
         with _progress(args.quiet) as tell:
             result = find_gap(logs, nominal, settings, rollouts, model_out, tell)
@@ -86,19 +92,6 @@ def _run(args: argparse.Namespace) -> int:
         result = replace(_without_empty_rollouts(result), notes=notes, simulator=rollouts.simulator)
     _conclude(args, folder, result)
     return 0
-
-
-def _rollouts(args: argparse.Namespace) -> Rollouts | None:
-    """What simulates, where it is wanted and there. Raises MeansError for one that was named."""
-    if args.no_simulation:
-        return None
-    try:
-        return Rollouts(args.simulator or "pybullet")
-    except MeansError as error:
-        if args.simulator is not None:
-            raise
-        terminal.warn([f"torques are compared, and nothing is simulated: {error}"])
-        return None
 
 
 @contextmanager

@@ -135,8 +135,7 @@ def _figures(figures: dict[str, Any], tree: Tree, report: str | None) -> Table:
         what = f"{plus_minus(load['m'], load['m_std'])} kg" if load else "superseded"
         table.add_row("change at the hand", f"at {change['stamp_s'] - start_s:.2f} s: {what}")
     watched = figures.get("disagreements", []) is not None
-    new = [sentence(x, start_s) for x in not_learned(figures)] if watched else [NOT_WATCHED]
-    for line in new:
+    for line in [sentence(x, start_s) for x in not_learned(figures)] if watched else [NOT_WATCHED]:
         table.add_row("new disagreement", line)
     if theta["validation_torque_rmse_nm"]:
         values = " ".join(f"{value:.3f}" for value in theta["validation_torque_rmse_nm"])

@@ -275,16 +275,14 @@ class _Problem:
         look = self._look(state)
         at = np.flatnonzero(self._prior == PRIOR_M**-2)
         step: Array = np.zeros(len(self._prior))
-        step[at] = -np.linalg.solve(
-            look.curvature[np.ix_(at, at)] + np.diag(self._prior[at]), look.gradient[at]
-        )
+        curvature = look.curvature[np.ix_(at, at)] + np.diag(self._prior[at])
+        step[at] = -np.linalg.solve(curvature, look.gradient[at])
         state = state.stepped(step)
         look = self._look(state)
         for _ in range(ROUNDS):
             pull = self._prior * state.offset(len(self._prior))
-            step = np.asarray(
-                np.linalg.solve(look.curvature + np.diag(self._prior), -look.gradient - pull)
-            )
+            curvature = look.curvature + np.diag(self._prior)
+            step = np.asarray(np.linalg.solve(curvature, -look.gradient - pull))
             for share in SHARES:
                 near = state.stepped(share * step)
                 found = self._look(near)

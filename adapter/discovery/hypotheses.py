@@ -18,16 +18,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from adapter.discovery import frames
 from adapter.discovery.axes import Axes, axes_of
 from adapter.discovery.bodies import LEVER_M, NO_JOINT, Bodies
-from adapter.discovery.frames import (
-    Mounting,
-    PairFit,
-    angular_misfit,
-    linear_misfit,
-    misfit_about_z,
-    mount,
-)
 from adapter.model.spatial import Array
 
 FREE = -1  # parent of a link that nothing in the recording carries
@@ -59,7 +52,7 @@ class Option:
     joint: int
     parent: int
     score: float
-    mounting: Mounting | None = field(default=None, compare=False)
+    mounting: frames.Mounting | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -93,10 +86,8 @@ def hypotheses_of(bodies: Bodies, misfit: dict[str, Array]) -> Hypotheses:
     ratios = [best_ratios(scores.ratios(j, found)) for j, found in enumerate(fits) if found]
     if ratios:
         scores.learn_excess({k: np.array([r[k] for r in ratios]) for k in linear})
-    options = tuple(
-        ranked(convention_options(scores, j, fits[j], misfit), scores, j)
-        for j in range(bodies.links)
-    )
+    found = (convention_options(scores, j, fits[j], misfit) for j in range(bodies.links))
+    options = tuple(ranked(own, scores, j) for j, own in enumerate(found))
     return Hypotheses(bodies, options, scores.excess)
 
 
@@ -118,7 +109,7 @@ def convention_misfit(bodies: Bodies) -> dict[str, Array]:
     The last joint is none; infinite where it cannot be. What rests is moved by no joint that moves.
     """
     joints = np.append(np.arange(bodies.log.q.shape[1]), NO_JOINT)
-    misfit = {**angular_misfit(bodies, joints), **linear_misfit(bodies, joints)}
+    misfit = {**frames.angular_misfit(bodies, joints), **frames.linear_misfit(bodies, joints)}
     moving = np.append(~bodies.resting, False)
     for x in misfit.values():
         for j in range(bodies.links):
@@ -155,7 +146,7 @@ def _fits(scores: Scores, link: int, where: list[tuple[int, int]]) -> Fits:
         if resting and i in shared:
             out[s, i] = shared[i]
             continue
-        out[s, i] = misfit_about_z(bodies, (link, i), joint, scores.of(link, s, i))
+        out[s, i] = frames.misfit_about_z(bodies, (link, i), joint, scores.of(link, s, i))
         if resting:
             shared[i] = out[s, i]
     return out
@@ -220,11 +211,8 @@ class Scores:
 
     def ratios(self, link: int, fits: Fits) -> list[dict[str, float]]:
         """Misfit over expected variance, by channel, of each fit of a link."""
-        found = []
-        for (s, i), misfit in fits.items():
-            of = self.of(link, s, i)
-            found.append({k: misfit[k] / of[k] for k in of})
-        return found
+        pairs = ((self.of(link, s, i), misfit) for (s, i), misfit in fits.items())
+        return [{k: misfit[k] / of[k] for k in of} for of, misfit in pairs]
 
     def learn_excess(self, ratios: dict[str, Array]) -> None:
         """Take for noise what the best explanations of most links leave over alike.
@@ -235,14 +223,11 @@ class Scores:
         for k, x in ratios.items():
             self.excess[k] = max(1.0, float(np.median(x[np.isfinite(x)])))
 
-    def score(self, channel: str, ratio: Array) -> Array:
-        """Log likelihood (...) of ratios (...) of misfit to expected variance."""
-        beyond = np.maximum(ratio / (self.excess[channel] * self.tolerance), 1.0)
-        return np.asarray(-0.5 * self._worth() * np.log(beyond))
-
     def total(self, ratios: Mapping[str, Array | float]) -> Array:
-        """Log likelihood (...) of all channels together."""
-        return np.asarray(sum(self.score(k, np.asarray(x)) for k, x in ratios.items()))
+        """Log likelihood (...) of ratios (...) of misfit to expected variance, of all channels."""
+        levels = {k: self.excess[k] * self.tolerance for k in ratios}
+        beyond = (np.log(np.maximum(x / levels[k], 1.0)) for k, x in ratios.items())
+        return np.asarray(-0.5 * self._worth() * sum(beyond))
 
     def free_score(self) -> float:
         """What a link costs that nothing carries."""
@@ -289,8 +274,13 @@ def mounted_hypotheses(bodies: Bodies, misfit: dict[str, Array]) -> Hypotheses:
     scores.learn_excess({k: np.array([ratios[k] for ratios in best]) for k in bodies.channels})
     found = [convention_options(scores, j, kept[j], misfit) for j in range(bodies.links)]
     _add_mounted(found, scores, pairs, fits)
-    options = tuple(ranked(_best(o), scores, j, RARE_PRIOR) for j, o in enumerate(found))
-    return Hypotheses(bodies, options, scores.excess, True)
+    options = []
+    for j, every in enumerate(found):
+        single: dict[tuple[int, int], Option] = {}  # of those that differ in the mounting the best
+        for option in sorted(every, key=lambda o: -o.score):
+            single.setdefault((option.joint, option.parent), option)
+        options.append(ranked(list(single.values()), scores, j, RARE_PRIOR))
+    return Hypotheses(bodies, tuple(options), scores.excess, True)
 
 
 def _pairs_of(scores: Scores) -> _Pairs:
@@ -314,7 +304,7 @@ def _pairs_of(scores: Scores) -> _Pairs:
     return _Pairs(axes, variance, ratio)
 
 
-def _fitted(scores: Scores, pairs: _Pairs) -> dict[Pair, PairFit]:
+def _fitted(scores: Scores, pairs: _Pairs) -> dict[Pair, frames.PairFit]:
     """Each promising pair once, the link with the lower number first."""
     bodies = scores.bodies
     bound = scores.total(pairs.ratio)
@@ -326,28 +316,28 @@ def _fitted(scores: Scores, pairs: _Pairs) -> dict[Pair, PairFit]:
     return {at: _fit(scores, pairs, at) for at in sorted(wanted)}
 
 
-def _fit(scores: Scores, pairs: _Pairs, at: Pair) -> PairFit:
+def _fit(scores: Scores, pairs: _Pairs, at: Pair) -> frames.PairFit:
     """A pair's fit; begun at its other link too where the first leaves more than noise.
 
     Both sides have the same minimum, but not the same ways into others.
     """
     s, j, i = at
     of = {k: float(x[at]) for k, x in pairs.variance.items()}
-    fit = mount(scores.bodies, (j, i), s, pairs.axes.axis[at], of)
+    fit = frames.mount(scores.bodies, (j, i), s, pairs.axes.axis[at], of)
     if i >= scores.bodies.links or scores.total(_ratios(pairs, at, fit)) >= 0.0:
         return fit
-    other = mount(scores.bodies, (i, j), s, pairs.axes.axis[s, i, j], of)
+    other = frames.mount(scores.bodies, (i, j), s, pairs.axes.axis[s, i, j], of)
     if sum(other.misfit[k] / of[k] for k in of) >= sum(fit.misfit[k] / of[k] for k in of):
         return fit
-    return PairFit(other.parent, other.child, other.misfit)
+    return frames.PairFit(other.parent, other.child, other.misfit)
 
 
-def _ratios(pairs: _Pairs, at: Pair, fit: PairFit) -> dict[str, float]:
+def _ratios(pairs: _Pairs, at: Pair, fit: frames.PairFit) -> dict[str, float]:
     return {k: fit.misfit[k] / float(x[at]) for k, x in pairs.variance.items()}
 
 
 def _add_mounted(
-    found: list[list[Option]], scores: Scores, pairs: _Pairs, fits: dict[Pair, PairFit]
+    found: list[list[Option]], scores: Scores, pairs: _Pairs, fits: dict[Pair, frames.PairFit]
 ) -> None:
     """Options of both ends of each pair; with its bound where it was not fitted."""
     worst = scores.free_score() - LOST
@@ -363,11 +353,3 @@ def _add_mounted(
             mounting = fits[mirror].parent
         if score >= worst:
             found[at[1]].append(Option(at[1], at[0], at[2], score + RARE_PRIOR, mounting))
-
-
-def _best(options: list[Option]) -> list[Option]:
-    """Of those that differ in the mounting only the better one."""
-    out: dict[tuple[int, int], Option] = {}
-    for option in sorted(options, key=lambda o: -o.score):
-        out.setdefault((option.joint, option.parent), option)
-    return list(out.values())

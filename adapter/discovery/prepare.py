@@ -112,11 +112,8 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> PreparedLog:
     moving = float(np.abs(dq[: 2 * through.edge]).max()) > RESTING
     notes = channels.notes
     if without_w.any():
-        start = (
-            "and what it was at the start is found from the joints' speeds"
-            if moving
-            else "all links taken to be at rest at the start"
-        )
+        start = "all links taken to be at rest at the start"
+        start = "and what it was at the start is found from the joints' speeds" if moving else start
         told = f"no angular velocity of links {listed(log.link_names, without_w)} is recorded"
         notes = (*notes, f"{told}; it is added up from their angular acceleration, {start}")
     return PreparedLog(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from adapter.discovery import tree_search
 from adapter.discovery.axes import with_start
 from adapter.discovery.bodies import NO_JOINT, Bodies, bodies_of
 from adapter.discovery.frames import Mounting
@@ -22,15 +23,6 @@ from adapter.discovery.hypotheses import (
     mounted_hypotheses,
 )
 from adapter.discovery.prepare import CUTOFF_HZ, PreparedLog, listed, prepare
-from adapter.discovery.tree_search import (
-    Ranked,
-    Structure,
-    TreeSearch,
-    central,
-    component,
-    floating_roots,
-    rootings,
-)
 from adapter.errors import ModelError
 from drivers.files.mcap import Log
 
@@ -82,7 +74,7 @@ class Discovery:
     edges: tuple[Edge, ...]
     undecided: tuple[str, ...]
     bodies: Bodies
-    structure: Structure
+    structure: tree_search.Structure
     hypotheses: Hypotheses
 
     def __repr__(self) -> str:
@@ -165,17 +157,17 @@ def discover(log: Log, cutoff_hz: float = CUTOFF_HZ, base: str | None = None) ->
             f"{log.path}: no joint moves ({', '.join(log.joint_names)}); nothing can be told"
         )
     misfit = convention_misfit(bodies)
-    structure: Structure | None = None
+    structure: tree_search.Structure | None = None
     if keeps_convention(bodies, misfit):
         hypotheses = hypotheses_of(bodies, misfit)
-        structure = TreeSearch(hypotheses.options, len(log.joint_names)).best()
+        structure = tree_search.TreeSearch(hypotheses.options, len(log.joint_names)).best()
     if structure is None or _unexplained(hypotheses, structure):
         hypotheses = mounted_hypotheses(bodies, misfit)
-        structure = TreeSearch(hypotheses.options, len(log.joint_names)).best()
+        structure = tree_search.TreeSearch(hypotheses.options, len(log.joint_names)).best()
     return _discovery(hypotheses, structure)
 
 
-def _unexplained(hypotheses: Hypotheses, structure: Structure) -> bool:
+def _unexplained(hypotheses: Hypotheses, structure: tree_search.Structure) -> bool:
     """Whether the convention leaves links that nothing carries, joints that move none, or more
     misfit than noise does."""
     bodies = hypotheses.bodies
@@ -192,34 +184,26 @@ def body_names(bodies: Bodies) -> tuple[str, ...]:
     return names if bodies.unseen_base is None else (*names, UNSEEN_BASE)
 
 
-def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
+def _discovery(hypotheses: Hypotheses, structure: tree_search.Structure) -> Discovery:
     bodies = hypotheses.bodies
-    search = TreeSearch(hypotheses.options, len(bodies.resting))
+    search = tree_search.TreeSearch(hypotheses.options, len(bodies.resting))
     shares: dict[int, dict[int, float]] = {}
     if hypotheses.mounted:
-        structure = central(search, bodies, structure)
-        for root in floating_roots(bodies, structure):
-            shares[root] = rootings(search, structure, root)
+        structure = tree_search.central(search, bodies, structure)
+        for root in tree_search.floating_roots(bodies, structure):
+            shares[root] = tree_search.rootings(search, structure, root)
     posterior = search.posterior(structure, shares)
     edges, roots, confidence = _judged(bodies, structure, shares, posterior)
     order = {name: k for k, name in enumerate(bodies.log.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
-    single, used = len(roots) == 1, {option.joint for option in structure.chosen}
+    single = len(roots) == 1
     return Discovery(
         root=next(iter(roots)) if single else None,
         root_confidence=next(iter(roots.values())) if single else 0.0,
         edges=kept,
         undecided=(
-            *_resting(bodies),
-            *(
-                f"joint {name} moves no link whose motion is in the recording; record the motion "
-                "of the link that it moves"
-                for s, name in enumerate(bodies.log.joint_names)
-                if s not in used
-            ),
-            *_roots(bodies, structure),
-            *_either_way(bodies, shares),
+            *_open(bodies, structure, shares),
             *_undecided(bodies, structure, posterior, shares, confidence),
         ),
         bodies=bodies,
@@ -230,7 +214,7 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
 
 def _judged(
     bodies: Bodies,
-    structure: Structure,
+    structure: tree_search.Structure,
     shares: dict[int, dict[int, float]],
     posterior: Sequence[Sequence[tuple[Option, float]]],
 ) -> tuple[list[Edge], dict[str, float], list[float]]:
@@ -256,13 +240,15 @@ def _judged(
     return edges, roots, confidence
 
 
-def _direction(structure: Structure, shares: dict[int, dict[int, float]], link: int) -> float:
+def _direction(
+    structure: tree_search.Structure, shares: dict[int, dict[int, float]], link: int
+) -> float:
     """Probability that a link is carried by its parent, not the other way round.
 
     The likeliest root that does not hang on the link is held against the likeliest that does: the
     number of links on either side of a joint says nothing.
     """
-    below = set(component(structure, link))
+    below = set(tree_search.component(structure, link))
     for root, share in shares.items():
         if link != root and link in share:
             inside = max(share[k] for k in below)
@@ -281,8 +267,11 @@ def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = Non
 # --- sentences on what is left open, why, and which motion would decide it ---------------------
 
 
-def _resting(bodies: Bodies) -> Iterator[str]:
-    log = bodies.log
+def _open(
+    bodies: Bodies, structure: tree_search.Structure, roots: Mapping[int, Mapping[int, float]]
+) -> Iterator[str]:
+    """`roots`: where a root is any link that moves, by it: which others it may be, how probably."""
+    log, names, chosen = bodies.log, body_names(bodies), structure.chosen
     for s in np.flatnonzero(bodies.resting):
         speed = float(np.sqrt(np.mean(log.dq[:, s] ** 2)))
         yield (
@@ -290,29 +279,25 @@ def _resting(bodies: Bodies) -> Iterator[str]:
             "its noise): which link it moves follows only from what the other joints leave over; "
             "move it"
         )
-
-
-def _roots(bodies: Bodies, structure: Structure) -> Iterator[str]:
-    names = body_names(bodies)
-    free = [names[option.link] for option in structure.chosen if option.parent == FREE]
-    carried = [option for option in structure.chosen if option.parent == bodies.unseen_base]
+    for idle in sorted(set(range(len(log.joint_names))) - {option.joint for option in chosen}):
+        yield (
+            f"joint {log.joint_names[idle]} moves no link whose motion is in the recording; record "
+            "the motion of the link that it moves"
+        )
+    free = [names[option.link] for option in chosen if option.parent == FREE]
+    carried = [option for option in chosen if option.parent == bodies.unseen_base]
     if len(free) + bool(carried) > 1:
         yield (
             f"no joint and no other link in the recording make {', '.join(free)} move as they do; "
             "a base may be one of them. The links that carry them are not in the recording, their "
             "sensors are late or loose"
         )
-    for option in structure.chosen:
+    for option in chosen:
         if option.joint == NO_JOINT and option.parent != FREE:
             yield (
                 f"links {names[option.link]} and {names[option.parent]} move as one body; a joint "
                 "between them, if there is one, did not move"
             )
-
-
-def _either_way(bodies: Bodies, roots: Mapping[int, Mapping[int, float]]) -> Iterator[str]:
-    """`roots`: where a root is any link that moves, by it: which others it may be, how probably."""
-    names = body_names(bodies)
     for root, shares in roots.items():
         if shares[root] >= DECIDED:
             continue
@@ -328,8 +313,8 @@ def _either_way(bodies: Bodies, roots: Mapping[int, Mapping[int, float]]) -> Ite
 
 def _undecided(
     bodies: Bodies,
-    structure: Structure,
-    posterior: Sequence[Ranked],
+    structure: tree_search.Structure,
+    posterior: Sequence[tree_search.Ranked],
     roots: Mapping[int, Mapping[int, float]],
     confidence: Sequence[float],
 ) -> Iterator[str]:
@@ -363,10 +348,8 @@ def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) ->
         return f"joint {' and '.join(dict.fromkeys(resting))} did not move: move it, by itself"
     dq, two = bodies.log.dq[:, pair], len(pair) == 2 and pair[0] != pair[1]
     if two and abs(float(np.corrcoef(dq[:, 0], dq[:, 1])[0, 1])) > ALIKE:
-        return (
-            f"joints {joints[pair[0]]} and {joints[pair[1]]} moved alike: move one without the "
-            "other"
-        )
+        both = " and ".join(joints[s] for s in pair)
+        return f"joints {both} moved alike: move one without the other"
     parents = [o.parent for o in (own, rival) if o.parent != FREE]
     if len(parents) == 2 and parents[0] != parents[1]:
         first, second = (names[i] for i in parents)
@@ -374,6 +357,5 @@ def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) ->
             f"{first} and {second} moved too much alike: move the joints between them while joint "
             f"{joints[own.joint] if own.joint != NO_JOINT else 'of the link'} moves too"
         )
-    return (
-        "what is left unexplained is no smaller than the difference: record longer or faster motion"
-    )
+    said = "what is left unexplained is no smaller than the difference"
+    return f"{said}: record longer or faster motion"

@@ -5,19 +5,25 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from adapter.experiments.baselines.compare import Errors, arm_tables, compare, contenders
 from adapter.experiments.baselines.learner import Columns, sub_chain, sub_parents
-from adapter.experiments.falls import Falls, Split, gathered, sets_of, split
+from adapter.experiments.baselines.paper import MEMBERS
+from adapter.experiments.falls import SETS, Falls, Split, gathered, sets_of, split
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
-from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
-from adapter.experiments.stated import PAPER_BASELINES, atlas_stated
-from adapter.experiments.topology import fall_logs, topology_trials
+from adapter.experiments.results import (
+    BOX_PERCENTILES,
+    PAPER_BASELINES,
+    AtlasResults,
+    LearnerScores,
+    Stated,
+)
+from adapter.experiments.topology import fall_logs, found_trees, topology_trials
 from adapter.learning.batch.prediction_errors import (
+    LEAST_TORQUE,
     KinematicErrors,
     kinematic_errors,
     predicted_torques,
@@ -29,7 +35,6 @@ from adapter.learning.settings import LearnerSettings, SchemaSettings
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import gravity_down
 from adapter.model.spatial import Array
-from adapter.model.tree import Tree
 from adapter.physics.identifiability import frame_observability
 from adapter.runs.outcome import frame_errors
 from adapter.runs.replay import BETWEEN_NS
@@ -40,8 +45,7 @@ from sim.falls.fall import atlas
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
 
-@dataclass(frozen=True)
-class Body:
+class Body(NamedTuple):
     """λ and θ of a tree as learned from 1 % of the training set.
 
     Attributes:
@@ -58,11 +62,6 @@ class Body:
     schema_s: float
     theta_s: float
 
-    @property
-    def learning_s(self) -> float:
-        """Both together."""
-        return self.schema_s + self.theta_s
-
 
 def learn_bodies(data: TreeData, seed: int) -> tuple[NetworkResult, Body, Body]:
     """λ by networks and by moments, and with each θ over bodies that can exist.
@@ -70,41 +69,31 @@ def learn_bodies(data: TreeData, seed: int) -> tuple[NetworkResult, Body, Body]:
     Returns:
         What the networks learned, the body with their λ, that with the moments'.
     """
-    marks = [time.perf_counter()]
-
-    def lap() -> float:
-        marks.append(time.perf_counter())
-        return marks[-1] - marks[-2]
-
-    networks = schema_by_networks(data, seed)
-    networks_s = lap()
-    lam = schema_from_moments(data).lam
-    moments_s = lap()
-    bodies = []
-    for name, own, schema_s in (
-        ("FOPnet", networks.lam, networks_s),
-        ("FOPnet, moments", lam, moments_s),
-    ):
-        theta = learn_theta(data, own)
-        bodies.append(Body(name, own, theta, schema_s, lap()))
-    return networks, bodies[0], bodies[1]
+    clock, begin_s = time.perf_counter, time.perf_counter()
+    networks, networks_s = schema_by_networks(data, seed), clock()
+    lam, moments_s = schema_from_moments(data).lam, clock()
+    first, first_s = learn_theta(data, networks.lam), clock()
+    second, second_s = learn_theta(data, lam), clock()
+    ours = Body("FOPnet", networks.lam, first, networks_s - begin_s, first_s - moments_s)
+    took_s = moments_s - networks_s, second_s - first_s
+    return networks, ours, Body("FOPnet, moments", lam, second, *took_s)
 
 
-@dataclass
-class Judged:
+class Judged(NamedTuple):
     """What a learned body is worth on all samples.
 
     Attributes:
         body: which it is.
         learned: torque errors of all joints, as a learner of the comparison.
         arm: the same of the joints alone that the others learn.
-        kinematics: on the control set; training: on the samples learned from.
+        kinematics: the largest on the control set, by channel.
+        training: kinematic errors on the samples learned from.
     """
 
     body: Body
     learned: LearnerScores
     arm: LearnerScores
-    kinematics: KinematicErrors
+    kinematics: dict[str, float]
     training: KinematicErrors
 
 
@@ -126,29 +115,22 @@ def judge(
     judged = []
     for body, whole, part, kinematics in errors:
         how = "mini-batches" if body.name == "FOPnet" else "second moments"
-        title = f"First-order-principles networks, λ from {how}"
-        learned = LearnerScores(body.name, title, train_s=body.learning_s)
+        title, took_s = (
+            f"First-order-principles networks, λ from {how}",
+            body.schema_s + body.theta_s,
+        )
+        learned = LearnerScores(body.name, title, train_s=took_s)
         learned.tuning = [
             f"λ from {len(learned_from)} samples, 1 % of the training set, by {how} in "
             f"{body.schema_s:.2f} s",
             f"θ over bodies that can exist, {len(body.theta.stages)} sub-problems in "
             f"{body.theta_s:.1f} s",
         ]
-        of_arm = part.into(LearnerScores(f"{body.name}, arm", title, train_s=body.learning_s))
+        of_arm = part.into(LearnerScores(f"{body.name}, arm", title, train_s=took_s))
+        largest = {k: max(x.largest[k] for x in kinematics) for k in kinematics[0].largest}
         training = kinematic_errors(learned_from, body.lam)
-        judged.append(Judged(body, whole.into(learned), of_arm, _worst(kinematics), training))
+        judged.append(Judged(body, whole.into(learned), of_arm, largest, training))
     return judged
-
-
-def _worst(parts: list[KinematicErrors]) -> KinematicErrors:
-    """Errors of several sets of samples as one."""
-    first = parts[0]
-    return KinematicErrors(
-        {k: max(p.largest[k] for p in parts) for k in first.largest},
-        {k: np.sum([p.histogram[k] for p in parts], axis=0) for k in first.histogram},
-        first.edges,
-        {k: np.max([p.largest_by_link[k] for p in parts], axis=0) for k in first.largest},
-    )
 
 
 def noisy_trial(source: Falls, parts: Split, true_lam: Array) -> dict[str, Any]:
@@ -229,8 +211,10 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         "train_samples": len(parts.train),
         "test_samples": len(parts.test),
         "learned_samples": len(data),
-        **_learning(networks, by_networks, by_moments, tree),
-        **_comparison(learners, [by_networks.arm, by_moments.arm]),
+        "schema_networks_not_converged": [
+            tree.joint_names[j] for j in np.flatnonzero(~networks.converged)
+        ],
+        **_learning(by_networks, by_moments, learners),
         "noise": noise,
         "online": online,
         "discover": found,
@@ -263,17 +247,24 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
 
 
 def _learning(
-    networks: NetworkResult, by_networks: Judged, by_moments: Judged, tree: Tree
+    by_networks: Judged, by_moments: Judged, learners: list[LearnerScores]
 ) -> dict[str, Any]:
-    """Without a suffix: λ from the moments; `_networks`: from mini-batches, as the paper."""
+    """Without a suffix: λ from the moments; `_networks`: from mini-batches, as the paper.
+
+    Best and worst are of the paper's three on the control set, held against ours on the arm alone.
+    """
     ours, theta = by_moments.learned, by_moments.body.theta
     settings = NetworkSettings()
+    paper = [x for x in learners if x.name in PAPER_BASELINES]
+    best = min(paper, key=lambda x: x.median["control"], default=None)
+    worst = max(paper, key=lambda x: x.median["control"], default=None)
+    error = max(by_networks.arm.median["control"], 1e-300)
     return {
         "minibatch": settings.minibatch,
         "cycles": settings.cycles,
         "theta_solver": "interior point (Clarabel)",
-        "kinematic_error_max": by_moments.kinematics.largest,
-        "kinematic_error_max_networks": by_networks.kinematics.largest,
+        "kinematic_error_max": by_moments.kinematics,
+        "kinematic_error_max_networks": by_networks.kinematics,
         "kinematic_error_max_training": by_moments.training.largest,
         "torque_relative_error_median": ours.median,
         "torque_relative_error_p99": ours.p99,
@@ -283,59 +274,113 @@ def _learning(
         "min_pseudo_inertia_eigenvalue": theta.min_eigenvalue,
         "base_parameters": theta.rank,
         "theta_converged": theta.converged,
-        "schema_networks_not_converged": [
-            tree.joint_names[j] for j in np.flatnonzero(~networks.converged)
-        ],
         "sub_problems": [
             {"name": stage.name, "bodies": len(stage.bodies), "rank": stage.rank,
              "parameters": stage.parameters, "wall_s": stage.wall_s}
             for stage in theta.stages
         ],
-        "learning_s": by_networks.body.learning_s,
-        "learning_moments_s": by_moments.body.learning_s,
+        "learning_s": by_networks.learned.train_s,
+        "learning_moments_s": ours.train_s,
         "schema_networks_s": by_networks.body.schema_s,
         "schema_moments_s": by_moments.body.schema_s,
         "theta_s": by_networks.body.theta_s,
-    }  # fmt: skip
-
-
-def _comparison(learners: Sequence[LearnerScores], arms: Sequence[LearnerScores]) -> dict[str, Any]:
-    """All learners, and the best and worst of the paper's three on the control set.
-
-    Args:
-        learners: of the page.
-        arms: the FOP networks on the arm's joints alone, those with the paper's λ first.
-    """
-    paper = [x for x in learners if x.name in PAPER_BASELINES]
-    best = min(paper, key=lambda x: x.median["control"], default=None)
-    worst = max(paper, key=lambda x: x.median["control"], default=None)
-    ours = max(arms[0].median["control"], 1e-300)
-    return {
         "learners": {
             x.name: {
                 "median": x.median, "p99": x.p99, "rmse_nm": x.rmse, "boxes": x.boxes,
                 "train_s": x.train_s, "sizes": x.sizes, "tuning": x.tuning,
                 "selection": x.selection,
             }
-            for x in (*learners, *arms)
+            for x in (*learners, by_networks.arm, by_moments.arm)
         },
         "box_percentiles": BOX_PERCENTILES,
         "best_baseline": None if best is None else best.name,
         "worst_baseline": None if worst is None else worst.name,
         "control_error_ratio_to_best_baseline": (
-            None if best is None else best.median["control"] / ours
+            None if best is None else best.median["control"] / error
         ),
     }  # fmt: skip
 
 
+# --- what the text of section IV.A states, beside what was measured here -------------------------
+
+
+def _baselines(numbers: dict[str, Any]) -> list[Stated]:
+    """The sizes of the paper's three."""
+
+    def size(learner: str, what: str) -> int | None:
+        sizes = numbers["learners"].get(learner, {}).get("sizes", {})
+        return round(sizes[what]) if what in sizes else None
+
+    arm = numbers["arm_joints"]
+    members, points = size("ELM", "members"), size("ELM", "points")
+    return [
+        Stated("arm", "joints of the right arm", "24 to 30", f"{arm[0]} to {arm[-1]}"),
+        Stated("ffnn_units", "network: tanh units", "1000", size("FFNN", "units")),
+        Stated("elm_members", "committee: machines", "50", members, "", f"{MEMBERS} with --full"),
+        Stated("elm_units", "committee: tanh units of each", "4000", size("ELM", "units")),
+        Stated("elm_points", "committee: samples of each", "10 000", points),
+        Stated("elm_samples", "committee: samples in all", "50 000",
+               None if members is None or points is None else members * points, "",
+               "the paper's 50 times 10 000 would be 500 000"),
+        Stated("gpr_points", "Gaussian process: samples", "10 000", size("GPR", "points")),
+    ]  # fmt: skip
+
+
+def atlas_stated(numbers: dict[str, Any]) -> list[Stated]:
+    """What the paper's text states, beside ours."""
+    kinematics = max(numbers["kinematic_error_max"].values())
+    networks = max(numbers["kinematic_error_max_networks"].values())
+    branches = dict.fromkeys(x["name"] for x in numbers["sub_problems"])
+    whole = sum(x["name"] == "whole tree" for x in numbers["sub_problems"])
+    ratio = numbers["control_error_ratio_to_best_baseline"]
+    seconds = numbers["trajectory_s"]
+    return [
+        Stated("joints", "degrees of freedom", "30", numbers["joints"]),
+        Stated("trajectories", "random trajectories", "63", numbers["trajectories"]),
+        Stated("trajectory_s", "length of each, at 1 kHz", "10 s", seconds, "s"),
+        Stated("control_trajectories", "of them control", "13", numbers["control_trajectories"]),
+        Stated("samples", "samples for training and test", "500 000",
+               numbers["train_samples"] + numbers["test_samples"]),
+        Stated("train_samples", "of them for training", "75 %", numbers["train_samples"], "",
+               "the paper prints 75 %/25 % as test/train"),
+        Stated("learned_samples", "samples for λ and θ", "1 % of training",
+               numbers["learned_samples"]),
+        Stated("minibatch", "samples of a mini-batch; cycles", "10; 10",
+               f"{numbers['minibatch']}; {numbers['cycles']}", "",
+               "N problems (eq. 18) from random λ, each batch a step of recursive Gauss-Newton"),
+        Stated("solver", "solver of θ", "interior point (fmincon)", numbers["theta_solver"]),
+        Stated("kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
+               "", "in m/s, rad/s, m/s² and rad/s², λ from moments"),
+        Stated("kinematic_error_max_networks", "the same, λ from mini-batches", "negligible",
+               networks),
+        Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches), "",
+               f"found from A; all bodies together {whole} times in the end, later ones weighted "
+               "by what the one before left"),
+        *(
+            Stated(f"torque_median_{name}", f"median error by eq. 20, {name} set", "minimal",
+                   numbers["torque_relative_error_median_networks"][name], "",
+                   f"where |τ| > {LEAST_TORQUE:g} N m; λ from mini-batches")
+            for name in SETS
+        ),
+        Stated("torque_median_moments", "the same, control set, λ from moments", "minimal",
+               numbers["torque_relative_error_median"]["control"]),
+        *_baselines(numbers),
+        Stated("worst_baseline", "worst of the three, control set", "GPR",
+               numbers["worst_baseline"]),
+        Stated("control_error_ratio", "right arm, control set: best baseline's error over ours",
+               "not stated", ratio, "times"),
+        Stated("learning_s", "time to learn λ and θ", "not stated", numbers["learning_s"], "s",
+               "without simulating the data; λ from mini-batches"),
+        Stated("noise_ratio", "torque error with noise over least squares with true λ",
+               "not stated", numbers["noise"]["ratio"], "", "control set"),
+        Stated("online_samples_per_second", "samples that the online learner takes",
+               "1 kHz (Panda)", numbers["online"]["samples_per_second"], "1/s", "on one core"),
+        found_trees(numbers["discover"]),
+    ]  # fmt: skip
+
+
 # --- the 1 kHz learner on the whole robot --------------------------------------------------------
 
-LOOK_EVERY = 5000  # samples between two looks at the errors
-# Noise of signals behind a filter, standard deviations: rad, rad/s, rad/s² of joints; rad/s,
-# m/s², rad/s² of bodies; share of the torque's own spread.
-NOISE_Q, NOISE_DQ, NOISE_DDQ = 2e-5, 1e-3, 2e-2
-NOISE_W, NOISE_A, NOISE_DW = 2e-3, 2e-2, 2e-2
-NOISE_TAU = 0.01
 # A look at 30 frames takes half a millisecond, a sample redone 0.1 ms: less of both than on an arm.
 SETTINGS = LearnerSettings(rebuild_rows=3, rebuild_stds=3.0, schema=SchemaSettings(judge_every=20))
 
@@ -345,18 +390,19 @@ def noisy(data: TreeData, seed: int) -> TreeData:
     wrench of a free fall stays zero."""
     rng = np.random.default_rng(seed)
 
-    def with_noise(x: Array, std: float | Array) -> Array:
-        return x + std * rng.normal(size=x.shape)
+    def with_noise(*pairs: tuple[Array, float | Array]) -> list[Array]:
+        return [x + std * rng.normal(size=x.shape) for x, std in pairs]
 
-    def moving(motion: BodyMotion) -> BodyMotion:
-        pairs = (motion.w, NOISE_W), (motion.a, NOISE_A), (motion.dw, NOISE_DW)
-        return BodyMotion(*(with_noise(*pair) for pair in pairs))
-
-    tau = with_noise(data.tau, NOISE_TAU * data.tau.std(axis=0))
-    pairs = (data.q, NOISE_Q), (data.dq, NOISE_DQ), (data.ddq, NOISE_DDQ)
-    q, dq, ddq = (with_noise(*pair) for pair in pairs)
+    # standard deviations behind a filter: of joints rad, rad/s, rad/s²; of bodies rad/s, m/s²,
+    # rad/s²; of torques a share of their own spread
     assert data.links is not None
-    return TreeData(data.tree, q, dq, ddq, tau, moving(data.base), moving(data.links))
+    (tau,) = with_noise((data.tau, 0.01 * data.tau.std(axis=0)))
+    q, dq, ddq = with_noise((data.q, 2e-5), (data.dq, 1e-3), (data.ddq, 2e-2))
+    base, links = (
+        BodyMotion(*with_noise((x.w, 2e-3), (x.a, 2e-2), (x.dw, 2e-2)))
+        for x in (data.base, data.links)
+    )
+    return TreeData(data.tree, q, dq, ddq, tau, base, links)
 
 
 def rms(x: Array) -> Array:
@@ -366,18 +412,18 @@ def rms(x: Array) -> Array:
 
 def held_out(learner: OnlineLearner, test: TreeData) -> dict[str, float]:
     """θ's torque error on exact motion never learned from, and least squares' on the samples."""
-    first = learner.tree.rows - learner.tree.n
-    states, theta = test.states(), learner.theta
+    first, states, theta = learner.tree.rows - learner.tree.n, test.states(), learner.theta
     ours = (learner.predict(states) - test.tau)[:, first:]
     in_use, best = theta.th.copy(), theta.least_squares()
     theta.th[:] = best
     batch = (learner.predict(states) - test.tau)[:, first:]
     theta.th[:] = in_use
     ratio = rms(ours) / rms(batch)
+    whole, least = (float(np.sqrt((x**2).mean())) for x in (ours, batch))
     return {
-        "torque_rms": float(np.sqrt((ours**2).mean())),
-        "least_squares_rms": float(np.sqrt((batch**2).mean())),
-        "over_least_squares": float(np.sqrt((ours**2).mean() / (batch**2).mean())),
+        "torque_rms": whole,
+        "least_squares_rms": least,
+        "over_least_squares": whole / least,
         "worst_joint_over_least_squares": float(ratio.max()),
         "median_joint_relative": float(np.median(rms(ours) / rms(test.tau[:, first:]))),
     }
@@ -399,21 +445,16 @@ def online_trial(
     test = test.take(slice(None, None, 10))
     learner = OnlineLearner(test.tree, settings=SETTINGS)
     seen = frame_observability(learner.tree, true_lam, gravity_down())
-    times_ns: list[int] = []
-    history: list[dict[str, float]] = []
-    clock_ns = 0
+    times_ns, history, clock_ns = list[int](), list[dict[str, float]](), 0
     for data in motions:
         for state in data.states(first_ns=clock_ns):
             before = time.perf_counter_ns()
             learner.step(state)
             times_ns.append(time.perf_counter_ns() - before)
-            if learner.learned % LOOK_EVERY == 0 and learner.theta_started_ns is not None:
-                turn, shift = frame_errors(learner.schema.lam[None], true_lam, seen.freedom)
-                where = {
-                    "seconds": 1e-3 * learner.learned,
-                    "turn_rad": float(turn.max()),
-                    "shift_m": float(shift.max()),
-                }
+            if learner.learned % 5000 == 0 and learner.theta_started_ns is not None:
+                off = frame_errors(learner.schema.lam[None], true_lam, seen.freedom)
+                turn, shift = (float(x.max()) for x in off)
+                where = {"seconds": 1e-3 * learner.learned, "turn_rad": turn, "shift_m": shift}
                 history.append(where | held_out(learner, test))
         clock_ns += round(1e6 * len(data)) + BETWEEN_NS
     started = learner.theta_started_ns

@@ -13,13 +13,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.table import Table
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.robots import read_robot, robot_urdf
+from adapter.effects.robots import robot_urdf
 from adapter.effects.torque import ModelTorque
-from adapter.experiments.court import Case, first, heard, tables, write_court
-from adapter.experiments.rivals import WAYS
+from adapter.experiments.court import compare
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.learning.theta import Filtered
@@ -30,50 +28,28 @@ from adapter.model.spatial import Array
 from adapter.physics.networks import inverse_dynamics, link_motion, theta_from_log_cholesky_torch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end
-from adapter.runs.terminal import output, say, show, write_json
+from adapter.runs.terminal import output, print_table, write_json
 from adapter.signals.filters import JointFilter
-from drivers.files.mcap import read_log
 from drivers.interface import JointSample
 
 WARM_UP = 2500  # samples, so that λ has settled and θ is being learned
-MOST_SLOW_REPEATS = 100
 # What figaroh 1.0.2 leaves of the log of a real Panda (Gaz et al. 2019) after 14 s, learned before;
 # measured by `adapter bench --log`.
 STATED_RMSE_NM = (0.157, 0.223, 0.139, 0.167, 0.063, 0.042, 0.049)
-STATED = "unseen torque of figaroh 1.0.2, log of Gaz et al. 2019, N m rms by joint:"
-MISSING = "extra [peers] is not installed"
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
     if args.log is not None:
-        return _compare(args)
-    rows = benchmark(max(args.repeats, 10))
-    table = Table("what", "p50 µs", "p99 µs", "note", box=None, pad_edge=False)
+        return compare(args)
+    rows, shown = benchmark(max(args.repeats, 10)), []
     for row in rows:
-        p50, p99 = row["p50_us"], row["p99_us"]
-        shown = ("-", "-") if p50 is None else (f"{p50:.1f}", f"{p99:.1f}")
-        table.add_row(row["what"], *shown, row["note"])
-    output.print(table)
-    output.print(STATED, *STATED_RMSE_NM)
+        times = ("-" if row[key] is None else f"{row[key]:.1f}" for key in ("p50_us", "p99_us"))
+        shown.append((row["what"], *times, row["note"]))
+    print_table(("what", "p50 µs", "p99 µs", "note"), shown)
+    stated = "unseen torque of figaroh 1.0.2, log of Gaz et al. 2019, N m rms by joint:"
+    output.print(stated, *STATED_RMSE_NM)
     write_json(args.json, {"rows": rows, "stated_rmse_nm": STATED_RMSE_NM})
-    return 0
-
-
-def _compare(args: argparse.Namespace) -> int:
-    """The ways to learn, side by side on a recording."""
-    unseen = None if args.hold_out is None else read_log(args.hold_out)
-    case = Case.of(read_log(args.log), read_robot(args.robot), args.validate_from, unseen)
-    verdicts = heard(case, args.only or list(WAYS), args.limit, args.rounds, say)
-    for shown in tables(verdicts):
-        table = Table(*shown.heads, box=None, pad_edge=False)
-        for row in shown.rows:
-            table.add_row(*row)
-        output.print(table, "")
-    show(first(verdicts))
-    write_json(args.json, {"ways": [v.as_json() for v in verdicts], "said": first(verdicts)})
-    if args.out is not None:
-        show(f"page: {write_court(verdicts, case, args.out / 'court.html')}")
     return 0
 
 
@@ -92,18 +68,14 @@ def benchmark(repeats: int) -> list[dict[str, Any]]:
     """One row per contender: what, p50_us, p99_us, note. Contenders not installed say so."""
     torch.set_num_threads(1)
     robot = documented("panda")
-    rows = _ours(robot, repeats)
-    rows.append(_autograd(robot, min(repeats, MOST_SLOW_REPEATS)))
-    rows.append(_pinocchio(robot, repeats))
-    rows.append(_peer(min(repeats, MOST_SLOW_REPEATS)))
-    return rows
+    few = min(repeats, 100)  # of what is slow
+    slow = _autograd(robot, few), _pinocchio(robot, repeats), _peer(few)
+    return [*_ours(robot, repeats), *slow]
 
 
 def _row(what: str, times_ns: list[int] | None, note: str) -> dict[str, Any]:
-    if times_ns is None:
-        return {"what": what, "p50_us": None, "p99_us": None, "note": note}
-    p50, p99 = np.percentile(1e-3 * np.array(times_ns), [50, 99])
-    return {"what": what, "p50_us": float(p50), "p99_us": float(p99), "note": note}
+    times = [None, None] if times_ns is None else np.percentile(times_ns, [50, 99]) / 1e3
+    return {"what": what, "p50_us": times[0], "p99_us": times[1], "note": note}
 
 
 def _timed(step: Callable[[Any], object], over: Iterable[Any]) -> list[int]:
@@ -194,7 +166,7 @@ def _peer(repeats: int) -> dict[str, Any]:
     """ADAM on one sample, the link masses being learned."""
     what = "differentiable-robot-model, ADAM"
     if importlib.util.find_spec("differentiable_robot_model") is None:
-        return _row(what, None, MISSING)
+        return _row(what, None, "extra [peers] is not installed")
     from differentiable_robot_model.rigid_body_params import UnconstrainedTensor
     from differentiable_robot_model.robot_model import DifferentiableRobotModel
 

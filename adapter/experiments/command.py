@@ -12,31 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.experiments.atlas import run_atlas
 from adapter.experiments.page.page import render_experiment
 from adapter.experiments.results import AtlasResults, PandaResults, Stated
-from adapter.experiments.stated import panda_stated
-from adapter.experiments.topology import panda_logs, panda_moves, topology_trials
+from adapter.experiments.topology import found_trees, panda_logs, panda_moves, topology_trials
 from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.model.spatial import Array
 from adapter.report.html import write_whole
+from adapter.runs import score, terminal
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
 from adapter.runs.pipeline import make_learner
 from adapter.runs.run_folder import RunData, run_data
-from adapter.runs.score import TORQUE_WINDOW_S, Course, figures, reference_from, trailing_rms
-from adapter.runs.terminal import (
-    json_ready,
-    output,
-    program_version,
-    results_folder,
-    show,
-    write_json,
-)
 from sim.scenarios import build
 
 PAGE = "experiment.html"
@@ -44,7 +34,7 @@ PAGE = "experiment.html"
 
 def run(args: argparse.Namespace) -> int:
     """Carry the command out; what one experiment found is written before the next begins."""
-    folder = results_folder(args.out, "experiment")
+    folder = terminal.results_folder(args.out, "experiment")
     atlas: AtlasResults | None = None
     panda: PandaResults | None = None
     for name in dict.fromkeys(args.names):
@@ -59,26 +49,26 @@ def run(args: argparse.Namespace) -> int:
             for name, results in (("atlas", atlas), ("panda", panda))
             if results is not None
         }
-        written = f"panda-adapter {program_version()}, seed {args.seed}"
+        written = f"panda-adapter {terminal.program_version()}, seed {args.seed}"
         write_whole(folder / PAGE, render_experiment(atlas, panda, written))
-        write_json(folder / "experiment.json", figures)
-        write_json(args.json, figures)
-    show(f"report {folder / PAGE}")
+        terminal.write_json(folder / "experiment.json", figures)
+        terminal.write_json(args.json, figures)
+    terminal.show(f"report {folder / PAGE}")
     return 0
 
 
 def print_stated(title: str, stated: list[Stated]) -> None:
     """The paper's figures and ours."""
-    table = Table("", "paper", "ours", title=title, title_justify="left", box=None, pad_edge=False)
+    rows = []
     for row in stated:
         unit = "" if row.ours is None else row.unit
-        table.add_row(row.what, row.paper or "-", f"{shown(row.ours)} {unit}".strip())
-    output.print(table)
+        rows.append((row.what, row.paper or "-", f"{shown(row.ours)} {unit}".strip()))
+    terminal.print_table(("", "paper", "ours"), rows, title=title, title_justify="left")
 
 
 def shown(value: Any) -> str:
     """A figure in few digits."""
-    value = json_ready(value)
+    value = terminal.json_ready(value)
     if value is None:
         return "not run"
     if isinstance(value, float):
@@ -94,15 +84,12 @@ def panda_results(run: RunData, rate_hz: float, discovered: dict[str, Any]) -> P
         rate_hz: samples a second of arm time.
         discovered: of `topology_trials` on recordings of such arms.
     """
-    n = run.n
-    theta_time = run.times(run.theta_trace)
+    n, lam, theta = run.n, run.figures["lambda"], run.figures["theta"]
     score_time, ratio = torque_ratio(run)
-    figures = run.figures
-    lam, theta = figures["lambda"], figures["theta"]
     start_s = theta["started_s"]
     numbers = {
         "joints": n,
-        "samples": figures["samples"],
+        "samples": run.figures["samples"],
         "rate_hz": rate_hz,
         "lambda_converged_s": lam["converged_s"],
         "lambda_rotation_error_rad": max(lam["rotation_error_rad"]),
@@ -115,14 +102,13 @@ def panda_results(run: RunData, rate_hz: float, discovered: dict[str, Any]) -> P
         "min_pseudo_inertia_eigenvalue": theta["min_pseudo_inertia_eigenvalue"],
         "discover": discovered,
     }
-    reference = run.documented.lam if run.reference is None else run.reference
     return PandaResults(
         tree=run.documented.tree,
         time_s=run.times(run.schema_trace),
         lam=run.schema_trace[:, 1:].reshape(-1, n, 6),
-        lam_true=reference,
+        lam_true=run.documented.lam if run.reference is None else run.reference,
         lam_shown=run.lam_shown > 0.99,
-        theta_time_s=theta_time,
+        theta_time_s=run.times(run.theta_trace),
         theta=run.theta_trace[:, 1 : 1 + 10 * n].reshape(-1, n, 10),
         theta_start_s=float("nan") if start_s is None else float(start_s),
         torque_time_s=score_time,
@@ -130,6 +116,29 @@ def panda_results(run: RunData, rate_hz: float, discovered: dict[str, Any]) -> P
         stated=panda_stated(numbers),
         numbers=numbers,
     )
+
+
+def panda_stated(numbers: dict[str, Any]) -> list[Stated]:
+    """The figures that the paper's text gives, beside ours."""
+    ours, turn = numbers.__getitem__, f"{score.ROTATION_GOAL_RAD:g} rad"
+    within = f"for good inside {turn} and {1e3 * score.POSITION_GOAL_M:g} mm in every direction"
+    batch = f"{score.TORQUE_GOAL:g} times batch least squares"
+    return [
+        Stated("rate_hz", "rate of the online learning", "1 kHz", ours("rate_hz"), "Hz"),
+        Stated("joints", "joints of the arm", "7", ours("joints")),
+        Stated("lambda_converged_s", "λ converged after", "40 s", ours("lambda_converged_s"), "s",
+               f"{within} that the data show"),
+        Stated("theta_started_s", "learning of θ begins at", "100 s", ours("theta_started_s"), "s",
+               "as soon as λ has converged, instead of at a time set by hand"),
+        Stated("theta_converged_s",
+               f"θ's torque error for good within {batch} after",
+               "not stated", ours("theta_converged_s"), "s"),
+        Stated("min_pseudo_inertia_eigenvalue",
+               "smallest eigenvalue of any link's pseudo-inertia, ever", "a feasible set",
+               ours("min_pseudo_inertia_eigenvalue"), "",
+               "above zero: every link is a possible body in every step"),
+        found_trees(numbers["discover"]),
+    ]  # fmt: skip
 
 
 def torque_ratio(run: RunData) -> tuple[Array, Array]:
@@ -140,8 +149,8 @@ def torque_ratio(run: RunData) -> tuple[Array, Array]:
         return np.zeros(0), np.zeros(0)
     tau, error = run.score_signals()[3:]
     time_s = run.times(rows)
-    ours = trailing_rms(time_s, error / run.noise, TORQUE_WINDOW_S)
-    best = trailing_rms(time_s, (tau - run.batch) / run.noise, TORQUE_WINDOW_S)
+    ours = score.trailing_rms(time_s, error / run.noise, score.TORQUE_WINDOW_S)
+    best = score.trailing_rms(time_s, (tau - run.batch) / run.noise, score.TORQUE_WINDOW_S)
     return time_s, ours / np.maximum(best, 1e-300)
 
 
@@ -160,22 +169,12 @@ def run_panda(seed: int, duration_s: float, topologies: int) -> PandaResults:
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder) / "truth.json"
         world.write_truth(truth)
-        reference = reference_from(truth, robot)
-    outcome = collect(learner)
-    numbers = figures(
-        outcome,
-        robot,
-        reference,
-        Course(len(samples), front_end.refused, front_end.first_moving_ns, front_end.delay_s),
-    )
-    run = run_data(
-        outcome,
-        robot,
-        json_ready(numbers),
-        reference,
-        delay_s=front_end.delay_s,
-        first_moving_ns=front_end.first_moving_ns,
-    )
+        reference = score.reference_from(truth, robot)
+    outcome, began_ns, delay_s = collect(learner), front_end.first_moving_ns, front_end.delay_s
+    course = score.Course(len(samples), front_end.refused, began_ns, delay_s)
+    numbers = terminal.json_ready(score.figures(outcome, robot, reference, course))
+    of = outcome, robot, numbers, reference
+    run = run_data(*of, delay_s=delay_s, first_moving_ns=began_ns)
     found = topology_trials(panda_logs(topologies, seed), robot.tree, seed)
     span_s = 1e-9 * (samples[-1].stamp_ns - samples[0].stamp_ns)
     return panda_results(run, (len(samples) - 1) / span_s, found)

@@ -7,6 +7,7 @@ under the measured torque, restarted from the measured state again and again.
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import os
 import pickle
@@ -14,15 +15,15 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from adapter import optional
+from adapter.effects.robots import read_robot
 from adapter.errors import ModelError, SettingsError
 from adapter.experiments.rivals import WAYS, Given, Learned, rigid, signals_of, spec_of
 from adapter.gap.hand import hand_frame
@@ -37,24 +38,22 @@ from adapter.report.html import fill, write_whole
 from adapter.report.style import Drawing, joint_color, legend
 from adapter.report.tables import Table
 from adapter.runs.replay import from_s, last_s
+from adapter.runs.terminal import output, print_table, say, show, write_json
 from adapter.screening.screen import of_this_robot, refuse
 from adapter.screening.timing import lateness
 from adapter.signals.matching import present
 from adapter.simulate import DrivenMotion, Rollouts
 from drivers.errors import choices
-from drivers.files.mcap import Log
+from drivers.files.mcap import Log, read_log
 
-OURS, GIVEN = "adapter gap", "as documented"
-LEARNED_SHARE = 2.0 / 3.0  # of a recording, where nobody says until when
+OURS = "adapter gap"
 HORIZONS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
-RESTART_S, MOST_STARTS = 0.5, 40
+MOST_STARTS = 40
 WORST_RAD = np.pi  # a simulation that runs away is off by no more
 UNKNOWN = np.full(len(HORIZONS_S), np.nan)
-CHILD = "import sys, pathlib, adapter.experiments.rivals as r; r.main(pathlib.Path(sys.argv[1]))"
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
+class Verdict(NamedTuple):
     """What became of one way to learn.
 
     Attributes:
@@ -73,26 +72,22 @@ class Verdict:
     notes: Sequence[str] = ()
     cpu_s: float = np.nan
     peak_mb: float = np.nan
-    torque_nm: Array = field(default_factory=lambda: np.zeros(0))
-    off_rad: Array = field(default_factory=UNKNOWN.copy)
-    off_m: Array = field(default_factory=UNKNOWN.copy)
-
-    def as_json(self) -> dict[str, Any]:
-        """Ready for a JSON file."""
-        return {k: x.tolist() if isinstance(x, np.ndarray) else x for k, x in vars(self).items()}
+    torque_nm: Array = UNKNOWN[:0]
+    off_rad: Array = UNKNOWN
+    off_m: Array = UNKNOWN
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """What is to be learned, and what it is judged on.
 
     Attributes:
-        model: as documented; learned: the samples to learn from; unseen: those to judge on.
+        model: as documented; learned: the samples to learn from.
+        unseen: those to judge on, cut at pauses.
     """
 
     model: SelfModel
     learned: Log
-    unseen: Log
+    unseen: Recorded
 
     @classmethod
     def of(cls, log: Log, model: SelfModel, until_s: float | None, hold_out: Log | None) -> Case:
@@ -110,44 +105,34 @@ class Case:
             raise ModelError(f"{model.name}: its base floats; only arms that stand are compared")
         optional.load("mujoco")
         model, _ = present(model, log.joint_names, log.path.name)
-        logs = [_screened(x, model) for x in (log, hold_out) if x is not None]
-        if hold_out is not None:
-            return cls(model, *logs)
-        end_s = last_s(logs[0])
-        until_s = LEARNED_SHARE * end_s if until_s is None else until_s
-        if not 0.0 < until_s < end_s:
-            raise SettingsError(f"validation from {until_s} s is outside 0 to {end_s:.1f} s")
-        return cls(model, from_s(logs[0], 0.0, until_s), from_s(logs[0], until_s))
-
-    @cached_property
-    def judged(self) -> Recorded:
-        """The unseen samples, cut at pauses."""
-        return Recorded.of(self.unseen, lateness(refuse(self.unseen, self.model).timing)).cut()
+        both = [refuse(of_this_robot(x, model), model) for x in (log, hold_out) if x is not None]
+        learned, unseen = (both[k].torque.in_time(both[k].log) for k in (0, -1))
+        if hold_out is None:
+            end_s = last_s(learned)
+            until_s = 2.0 / 3.0 * end_s if until_s is None else until_s
+            if not 0.0 < until_s < end_s:
+                raise SettingsError(f"validation from {until_s} s is outside 0 to {end_s:.1f} s")
+            learned, unseen = from_s(learned, 0.0, until_s), from_s(learned, until_s)
+        judged = Recorded.of(unseen, lateness(refuse(unseen, model).timing)).cut()
+        return cls(model, learned, judged)
 
     def verdict(self, way: str, learned: Learned, cpu_s: float, peak_mb: float) -> Verdict:
         """Judge what was learned."""
         simulated, notes = lasting(learned.model), [*learned.notes]
-        torque = rms([torque_errors(self.judged, self.model, [simulated]).after])
+        torque = rms([torque_errors(self.unseen, self.model, [simulated]).after])
         n = simulated.tree.n
-        if not is_consistent(simulated.theta[-n:]):
+        if not is_consistent(simulated.theta):
             q, dq, ddq, _ = (x[::50] for x in signals_of(self.learned))
             Y = RigidArm.of(simulated).regressor(q, dq, ddq).reshape(-1, 10 * n)
             told = RigidArm.of(self.model).theta
-            bodies = possible_theta(simulated.theta[-n:], told, Y.T @ Y)
-            simulated = replace(simulated, theta=np.r_[simulated.theta[:-n], bodies])
+            simulated = replace(simulated, theta=possible_theta(simulated.theta, told, Y.T @ Y))
             notes.append("its bodies cannot exist: simulated with the nearest that can, by torque")
         simulate, mujoco = Rollouts("mujoco"), optional.load("mujoco")
         mujoco.set_mju_user_warning(lambda said: None)  # runaways are counted, not logged
-        off, hand, away = rollouts(self.judged, simulated, self.model, simulate)
+        off, hand, away = rollouts(self.unseen, simulated, self.model, simulate)
         mujoco.set_mju_user_warning(None)
         notes += simulate.troubles + [f"{away} rollouts run away"] * (away > 0)
         return Verdict(way, True, learned.names, notes, cpu_s, peak_mb, torque, off, hand)
-
-
-def _screened(log: Log, model: SelfModel) -> Log:
-    """Raises RecordingRefused."""
-    seen = refuse(of_this_robot(log, model), model)
-    return seen.torque.in_time(seen.log)
 
 
 def rollouts(
@@ -157,8 +142,8 @@ def rollouts(
 
     And how many ran away.
     """
-    length, every = (round(s / ROLLOUT_STEP_S) for s in (HORIZONS_S[-1], RESTART_S))
-    at = np.array([round(s / ROLLOUT_STEP_S) for s in HORIZONS_S])
+    at, every = np.rint(np.array(HORIZONS_S) / ROLLOUT_STEP_S).astype(int), 500  # half a second
+    length = int(at[-1])
     lanes, off = length // every + 1, list[Array]()  # rollouts overlap: those of a lane do not
     for part in recording.stretches():
         t = part.grid()
@@ -171,13 +156,12 @@ def rollouts(
             found, _ = simulate(model, DrivenMotion(t, q, dq, u), segments, MEASURED)
             for begin in lane:
                 rows = begin + at[begin + at < len(t)]
-                wrong = np.clip(
-                    np.nan_to_num(found[rows] - q[rows], nan=WORST_RAD), -WORST_RAD, WORST_RAD
-                )
+                wrong = np.nan_to_num(found[rows] - q[rows], nan=WORST_RAD)
+                wrong = np.clip(wrong, -WORST_RAD, WORST_RAD)
                 reached = hand_at(documented, q[rows] + wrong) - hand_at(documented, q[rows])
-                error = np.c_[wrong, np.linalg.norm(reached, axis=1)]
-                rest = np.full((len(at) - len(rows), error.shape[1]), np.nan)
-                off.append(np.concatenate([error, rest]))
+                error = np.full((len(at), q.shape[1] + 1), np.nan)
+                error[: len(rows)] = np.c_[wrong, np.linalg.norm(reached, axis=1)]
+                off.append(error)
     errors = np.array(off) if not simulate.troubles else np.full((1, len(at), 2), np.nan)
     away = int((np.abs(errors[:, :, :-1]) >= WORST_RAD).any(axis=(1, 2)).sum())
     with warnings.catch_warnings():
@@ -211,7 +195,8 @@ def heard(
     for way in ways:
         if way not in WAYS:
             raise SettingsError(f"no way to learn '{way}'; {choices(way, WAYS)}")
-    verdicts, findings = list[Verdict](), list[dict[str, Any]]()
+    verdicts: list[Verdict] = []
+    findings: Sequence[Mapping[str, Any]] = ()
     for way in ways:
         tell(way)
         given = Given(case.learned, case.model, rounds, findings)
@@ -219,11 +204,9 @@ def heard(
         if isinstance(found, str):
             verdicts.append(Verdict(way, notes=[found]))
             continue
-        learned, cost = found
-        if way == OURS:
-            findings = [{**x, "interval_s": None} for x in learned.findings]
+        findings = found[0].findings if way == OURS else findings
         try:
-            verdicts.append(case.verdict(way, learned, **cost))
+            verdicts.append(case.verdict(way, found[0], **found[1]))
         except (ModelError, ValueError, np.linalg.LinAlgError) as error:
             verdicts.append(Verdict(way, notes=[f"what it learned cannot be judged: {error}"]))
     return verdicts
@@ -237,7 +220,8 @@ def in_a_process(way: str, given: Given, limit_s: float) -> tuple[Learned, dict[
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "asked"
         path.write_bytes(pickle.dumps((way, given)))
-        command = [sys.executable, "-c", CHILD, os.fspath(path)]
+        child = "import sys, adapter.experiments.rivals as ways; ways.main(sys.argv[1])"
+        command = [sys.executable, "-c", child, os.fspath(path)]
         alone = {**os.environ, "OMP_NUM_THREADS": "1"}
         try:
             done = subprocess.run(
@@ -293,8 +277,19 @@ def tables(verdicts: Sequence[Verdict]) -> list[Table]:
     ]
 
 
-def write_court(verdicts: Sequence[Verdict], case: Case, path: Path) -> Path:
-    """Write the page. Raises RunFolderError."""
+def compare(args: argparse.Namespace) -> int:
+    """Carry out `adapter bench --log`; returns the exit code."""
+    unseen = None if args.hold_out is None else read_log(args.hold_out)
+    case = Case.of(read_log(args.log), read_robot(args.robot), args.validate_from, unseen)
+    verdicts = heard(case, args.only or list(WAYS), args.limit, args.rounds, say)
+    shown, said = tables(verdicts), first(verdicts)
+    for table in shown:
+        print_table(table.heads, table.rows)
+        output.print()
+    show(said)
+    write_json(args.json, {"ways": [v._asdict() for v in verdicts], "said": said})
+    if args.out is None:
+        return 0
     drawing = Drawing("half", stretch=1.4)
     ax = drawing.axes[0]
     for k, verdict in enumerate(v for v in verdicts if np.isfinite(v.off_rad).any()):
@@ -303,12 +298,13 @@ def write_court(verdicts: Sequence[Verdict], case: Case, path: Path) -> Path:
     ax.set_yscale("log")
     ax.set_xlabel("s after the restart")
     legend(ax, ncols=1, fontsize=6, loc="upper left")
+    note = "rms over joints, median of the restarts"
     context = {
-        "about": f"{case.learned.path.name}, judged on {case.unseen.path.name}",
-        "headline": first(verdicts),
-        "tables": tables(verdicts),
-        "panels": [
-            drawing.panel("Forward simulation", "mrad", "rms over joints, median of the restarts")
-        ],
+        "about": f"{case.learned.path.name}, judged on {case.unseen.name}",
+        "headline": said,
+        "tables": shown,
+        "panels": [drawing.panel("Forward simulation", "mrad", note)],
     }
-    return write_whole(path, fill("court.html", context, "adapter.experiments"))
+    page = fill("court.html", context, "adapter.experiments")
+    show(f"page: {write_whole(args.out / 'court.html', page)}")
+    return 0

@@ -75,9 +75,8 @@ def split(lengths: list[int], seed: int) -> Split:
     """
     count = len(lengths)
     if count < LEAST_TRAJECTORIES:
-        raise ModelError(
-            f"the experiment needs at least {LEAST_TRAJECTORIES} trajectories, got {count}"
-        )
+        needs = f"the experiment needs at least {LEAST_TRAJECTORIES} trajectories"
+        raise ModelError(f"{needs}, got {count}")
     used = _used(count)
     order = np.random.default_rng(seed).permutation(sum(lengths[:used]))
     cut = round(TRAIN_SHARE * len(order))
@@ -100,16 +99,10 @@ class Falls:
         """Trajectory k without noise."""
         record = self._exact.exact(k)
         v, w, a, dw = record.links(self.truth)
-        free = np.zeros((len(record.q), 6))  # nothing pushes a falling base
-        return TreeData(
-            self.tree,
-            record.q,
-            record.dq,
-            record.ddq,
-            np.hstack([free, record.tau]),
-            BodyMotion(record.base_w, record.base_a, record.base_dw, record.base_v),
-            BodyMotion(w, a, dw, v),
-        )
+        tau = np.hstack([np.zeros((len(record.q), 6)), record.tau])  # nothing pushes a falling base
+        base = BodyMotion(record.base_w, record.base_a, record.base_dw, record.base_v)
+        joints = record.q, record.dq, record.ddq, tau
+        return TreeData(self.tree, *joints, base, BodyMotion(w, a, dw, v))
 
     def measured(self, k: int) -> TreeData:
         """Trajectory k as its sensors show it, filtered alike."""
@@ -118,13 +111,9 @@ class Falls:
 
 def gathered(source: Falls, parts: Split, rows: np.ndarray, noisy: bool) -> TreeData:
     """Samples at these rows of the train-and-test part."""
-    found = []
-    for k in range(len(parts.lengths)):
-        own = parts.rows_in(rows, k)
-        if len(own):
-            data = source.measured(k) if noisy else source.exact(k)
-            found.append(data.take(own))
-    return stacked(found)
+    of = source.measured if noisy else source.exact
+    parted = [parts.rows_in(rows, k) for k in range(len(parts.lengths))]
+    return stacked([of(k).take(own) for k, own in enumerate(parted) if len(own)])
 
 
 def sets_of(source: Falls, parts: Split) -> Iterator[tuple[TreeData, dict[str, np.ndarray]]]:

@@ -10,6 +10,7 @@ import numpy as np
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 
+PAPER_BASELINES = ("FFNN", "ELM", "GPR")
 # Of a box by eq. 20: whisker, quartile, median, quartile, whisker.
 BOX_PERCENTILES = (5.0, 25.0, 50.0, 75.0, 95.0)
 

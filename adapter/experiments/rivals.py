@@ -44,11 +44,6 @@ from adapter.signals.validation import EDGE_S, GRID_S, smooth
 from drivers.files.mcap import Log
 
 FRICTION = ("viscous_friction", "coulomb_friction", "motor_inertia", "torque_offset")
-STD = (VISCOUS_NM_S, COULOMB_NM, MOTOR_KG_M2, OFFSET_NM)
-ALIKE_S, EVERY = 0.3, 10  # s in which rows say the same; ms between rows
-SEGMENT_S = 0.1  # that mujoco.sysid simulates from a measured state; longer ones run away
-ROLLED_S = 0.5  # the same of the evolution
-GENERATIONS = 10  # of it to one round
 # What MuJoCo's joint has of an effect: where, begin, least and most, as PACE has them but for dry
 # friction, which a large arm has more of than its 0.5 N m. Its motor has a bias.
 FIELDS = {
@@ -97,13 +92,11 @@ def rigid(model: SelfModel) -> SelfModel:
 
 def with_effects(model: SelfModel, theta: Array, found: Mapping[str, Array]) -> SelfModel:
     """The model with bodies theta (n, 10) and a number (n,) of each effect in every joint."""
-    entries = [
-        {"effect": name, "parameters": {KNOWN[name].parameters[0].key: np.asarray(x).tolist()}}
-        for name, x in found.items()
-    ]
-    joints, base = list(range(1, model.tree.n + 1)), model.theta[: len(model.theta) - len(theta)]
-    effects = tuple({**entry, "joints": joints} for entry in entries)
-    return replace(model, theta=np.concatenate([base, theta]), effects=effects)
+    joints, effects = list(range(1, model.tree.n + 1)), list[dict[str, Any]]()
+    for name, x in found.items():
+        numbers = {KNOWN[name].parameters[0].key: x.tolist()}
+        effects.append({"effect": name, "parameters": numbers, "joints": joints})
+    return replace(model, theta=theta, effects=tuple(effects))
 
 
 def signals_of(log: Log) -> Signals:
@@ -138,16 +131,19 @@ def least_squares(given: Given) -> Learned:
     Each with a prior of a physical size that nothing widens: 5 % of the documented bodies, a load
     of some kg in the last one. Weights are those of what is left, joint by joint.
     """
-    model, (q, dq, ddq, tau) = rigid(given.model), (x[::EVERY] for x in signals_of(given.log))
+    model, every = rigid(given.model), round(0.01 / GRID_S)
+    q, dq, ddq, tau = (x[::every] for x in signals_of(given.log))
     arm, n = RigidArm.of(model), model.tree.n
     Y = arm.regressor(q, dq, ddq)
     joint = by_joint((dq, smooth_sign(dq, ddq, SMOOTHING_S), ddq, np.ones_like(q)))
     X, more = np.concatenate([Y, joint], axis=2), tau - arm.torque(q, dq, ddq)
     bodies = theta_prior(arm.theta, 0.05)
     bodies[-1] = np.hypot(bodies[-1], LOAD_STD)
-    std = np.concatenate([bodies.ravel(), np.repeat(STD, n)])
+    rest = np.repeat([VISCOUS_NM_S, COULOMB_NM, MOTOR_KG_M2, OFFSET_NM], n)
+    std = np.concatenate([bodies.ravel(), rest])
     low = np.where((np.arange(len(std)) >= 10 * n) & (np.arange(len(std)) < 13 * n), 0.0, -np.inf)
-    level, alike, x = more.std(axis=0), np.sqrt(ALIKE_S / GRID_S / EVERY), np.zeros(len(std))
+    level, x = more.std(axis=0), np.zeros(len(std))
+    alike = np.sqrt(0.3 / GRID_S / every)  # rows within 0.3 s say the same
     for _ in range(3):  # of weights after fit
         weighed = np.concatenate([X, more[:, :, None]], axis=2) / (alike * level)[:, None]
         table = np.asarray(np.linalg.qr(weighed.reshape(-1, len(std) + 1), mode="r"))
@@ -181,11 +177,21 @@ def figaroh(given: Given) -> Learned:
         def process_kinematics_data(self, filter_config: object = None) -> None:
             self.processed_data = dict(self.raw_data)
 
-    n = model.tree.n
+    # Its settings: every joint with friction, offset and motor inertia, as from zero.
+    n, parts = model.tree.n, ("friction", "actuator_inertia", "joint_offset")
+    zeros, joints = [0] * n, {"active_joints": list(model.tree.joint_names)}
+    mechanics = {
+        "friction_coefficients": {"viscous": zeros, "static": zeros},
+        "actuator_inertias": zeros,
+        "joint_offsets": zeros,
+    }
+    problem = {"model_components": dict.fromkeys(parts, True)}
+    task = {"type": "identification", "problem": problem, "mechanics": mechanics}
+    own = {"name": "arm", "properties": {"joints": joints}}
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         urdf, settings = Path(folder) / "arm.urdf", Path(folder) / "settings.yaml"
         urdf.write_text(robot_urdf(model, alone=True).text)
-        settings.write_text(_settings(model))
+        settings.write_text(json.dumps({"robot": own, "tasks": {"identification": task}}))
         arm = load_robot(os.fspath(urdf), load_by_urdf=True)
         work = Identification(arm, os.fspath(settings))
         work.identif_config.update(act_idxq=list(range(n)), act_idxv=list(range(n)))
@@ -196,21 +202,6 @@ def figaroh(given: Given) -> Learned:
     theta = x[: 10 * n].reshape(n, 10)[:, [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]  # XX XY YY XZ YZ ZZ
     effects = dict(zip(FRICTION, x[10 * n :].reshape(-1, n), strict=True))
     return Learned(with_effects(model, theta, effects))
-
-
-def _settings(robot: SelfModel) -> str:
-    """Its file of settings: every joint with friction, offset and motor inertia, as from zero."""
-    zeros, parts = [0] * robot.tree.n, ("friction", "actuator_inertia", "joint_offset")
-    mechanics = {
-        "friction_coefficients": {"viscous": zeros, "static": zeros},
-        "actuator_inertias": zeros,
-        "joint_offsets": zeros,
-    }
-    problem = {"model_components": dict.fromkeys(parts, True)}
-    task = {"type": "identification", "problem": problem, "mechanics": mechanics}
-    joints = {"active_joints": list(robot.tree.joint_names)}
-    own = {"name": "arm", "properties": {"joints": joints}}
-    return json.dumps({"robot": own, "tasks": {"identification": task}})
 
 
 # --- MuJoCo's own, and evolution in MuJoCo -------------------------------------------------------
@@ -255,9 +246,27 @@ def sysid(
             change = partial(_set_of_joint, names[j], place)
             key = f"{names[j]}_{place}"
             parameters.add(sysid.Parameter(key, begin, least, most, modifier=change))
-    whole = sysid.ModelSequences("arm", spec, *_segments(compiled, logs))
-    sizes = np.concatenate([np.stack([q, dq], axis=2) for q, dq, _ in logs]).std(axis=0).ravel()
-    own = {"modify_residual": partial(_difference, sizes), "n_threads": 1}
+    told = [np.stack([q, dq], axis=2).reshape(len(q), -1) for q, dq, _ in logs]
+    step, parts = round(0.1 / GRID_S), list[tuple[Any, ...]]()  # longer ones run away
+    seconds: Array = GRID_S * np.arange(step, dtype=np.float64)
+    for k, (q, dq, tau) in enumerate(logs):
+        for start in range(0, len(q) - step, step):  # name, first state, control, measurement
+            part = slice(start, start + step)
+            state = sysid.create_initial_state(compiled, q[start], dq[start], None)
+            sensors = sysid.TimeSeries.from_names(seconds, told[k][part], compiled)
+            parts.append((f"{k}:{start}", state, sysid.TimeSeries(seconds, tau[part]), sensors))
+    whole = sysid.ModelSequences("arm", spec, *map(list, zip(*parts, strict=True)))
+    sizes = np.concatenate(told).std(axis=0)
+
+    def difference(_: Any, predicted: Any, measured: Any, *__: Any, **___: Any) -> Any:
+        """Errors in standard deviations of each signal in all of the recording.
+
+        Its own are in those of a tenth of a second: a joint that rests so long is all that counts.
+        """
+        predicted = predicted.resample(measured.times)
+        return (measured.data - predicted.data) / sizes, predicted, measured
+
+    own = {"modify_residual": difference, "n_threads": 1}
     residual = sysid.build_residual_fn(models_sequences=[whole], **own)
     first, _, _ = residual(parameters.as_vector(), parameters)
     best, _ = sysid.optimize(parameters, residual, verbose=False, max_iters=rounds)
@@ -271,34 +280,6 @@ def sysid(
             values[effect][j] = best[f"{names[j]}_{place}"].value[0]
     before, after = (float(np.sqrt(np.mean(np.concatenate(x) ** 2))) for x in (first, last))
     return with_effects(model, theta, values), (before, after)
-
-
-def _segments(compiled: Any, logs: Sequence[tuple[Array, Array, Array]]) -> tuple[list[Any], ...]:
-    """Names, first states, controls and measurements of what is simulated in one go."""
-    from mujoco import sysid
-
-    step, found = round(SEGMENT_S / GRID_S), list[tuple[Any, ...]]()
-    seconds: Array = GRID_S * np.arange(step, dtype=np.float64)
-    for k, (q, dq, tau) in enumerate(logs):
-        measured = np.stack([q, dq], axis=2).reshape(len(q), -1)
-        for start in range(0, len(q) - step, step):
-            part = slice(start, start + step)
-            state = sysid.create_initial_state(compiled, q[start], dq[start], None)
-            sensors = sysid.TimeSeries.from_names(seconds, measured[part], compiled)
-            control = sysid.TimeSeries(seconds, tau[part])
-            found.append((f"{k}:{start}", state, control, sensors))
-    return tuple(map(list, zip(*found, strict=True)))
-
-
-def _difference(
-    sizes: Array, parameters: Any, predicted: Any, measured: Any, *_: Any, **__: Any
-) -> tuple[Array, Any, Any]:
-    """Errors in standard deviations of each signal in all of the recording.
-
-    Its own are in those of a tenth of a second: a joint that rests for so long is all that counts.
-    """
-    predicted = predicted.resample(measured.times)
-    return (measured.data - predicted.data) / sizes, predicted, measured
 
 
 def _set_of_body(name: str, spec: Any, parameter: Any) -> None:
@@ -324,32 +305,26 @@ def _set_of_joint(name: str, place: str, spec: Any, parameter: Any) -> None:
     setattr(joint, place, np.r_[value, 0.0 * as_now[1:]] if len(as_now) > 1 else value)
 
 
-def sysid_all(given: Given) -> Learned:
-    """`mujoco.sysid` with friction, damping and armature of all joints and the last body free."""
-    n = given.model.tree.n
-    free = {**dict.fromkeys(FIELDS, range(n)), "bodies": (n - 1,)}
-    return _by_sysid(given, free)
+def by_sysid(told: bool, given: Given) -> Learned:
+    """`mujoco.sysid` with friction, damping and armature of all joints and the last body free.
 
-
-def sysid_told(given: Given) -> Learned:
-    """`mujoco.sysid` with what our gap named and nothing else, as far as MuJoCo's joint has it."""
-    n, free, cannot = given.model.tree.n, dict[str, set[int]](), set()
-    for active in active_effects([{**f, "interval_s": None} for f in given.findings], n):
-        name = active.effect.name
-        if name in TAKEN:
-            free.setdefault(TAKEN[name], set()).add(active.joint % n)
-        else:
-            cannot.add(name)
-    notes = [f"not in it: {', '.join(sorted(cannot))}"] if cannot else []
-    if not free:
-        return Learned(rigid(given.model), [*notes, "nothing was named that it could fit"])
-    return _by_sysid(given, {key: sorted(x) for key, x in free.items()}, notes)
-
-
-def _by_sysid(given: Given, free: Free, notes: Sequence[str] = ()) -> Learned:
+    Told, it is what our gap named and nothing else, as far as MuJoCo's joint has it.
+    """
+    n, notes = given.model.tree.n, list[str]()
+    free: dict[str, set[int]] = {**{key: set(range(n)) for key in FIELDS}, "bodies": {n - 1}}
+    if told:
+        named = active_effects([{**f, "interval_s": None} for f in given.findings], n)
+        free, cannot = {}, {x.effect.name for x in named} - set(TAKEN)
+        for x in named:
+            if x.effect.name in TAKEN:
+                free.setdefault(TAKEN[x.effect.name], set()).add(x.joint % n)
+        notes = [f"not in it: {', '.join(sorted(cannot))}"] if cannot else []
+        if not free:
+            return Learned(rigid(given.model), [*notes, "nothing was named that it could fit"])
     q, dq, _, tau = signals_of(given.log)
-    model, (before, after) = sysid(rigid(given.model), [(q, dq, tau)], free, given.rounds)
-    count = sum((10 if key == "bodies" else 1) * len(list(x)) for key, x in free.items())
+    searched = {key: sorted(x) for key, x in free.items()}
+    model, (before, after) = sysid(rigid(given.model), [(q, dq, tau)], searched, given.rounds)
+    count = sum((10 if key == "bodies" else 1) * len(x) for key, x in searched.items())
     fell = f"{count} numbers; its residual {before:.3g} -> {after:.3g}"
     return Learned(model, [fell, *notes])
 
@@ -357,14 +332,14 @@ def _by_sysid(given: Given, free: Free, notes: Sequence[str] = ()) -> Learned:
 def evolution(given: Given) -> Learned:
     """CMA-ES on rollouts, as PACE: armature, damping, dry friction and a bias of every encoder.
 
-    A candidate's cost is the mean square of its positions' error in rollouts of `ROLLED_S`.
+    A candidate's cost is the mean square of its positions' error in rollouts of half a second.
     """
     import cma
     import mujoco
     from mujoco import rollout
 
     q, dq, _, tau = signals_of(given.log)
-    model, n, length = rigid(given.model), given.model.tree.n, round(ROLLED_S / GRID_S)
+    model, n, length = rigid(given.model), given.model.tree.n, round(0.5 / GRID_S)
     compiled = spec_of(model).compile()
     data, scratch = mujoco.MjData(compiled), mujoco.MjData(compiled)
     starts = np.arange(0, len(q) - length, length)
@@ -387,7 +362,7 @@ def evolution(given: Given) -> Learned:
         return float(np.mean(off**2)) if np.isfinite(off).all() else 1e9
 
     begin = np.repeat([*(x / m for _, x, _, m in FIELDS.values()), 0.5], n)
-    limits = {"bounds": [0, 1], "seed": 1, "verbose": -9, "maxiter": GENERATIONS * given.rounds}
+    limits = {"bounds": [0, 1], "seed": 1, "verbose": -9, "maxiter": 10 * given.rounds}
     search = cma.CMAEvolutionStrategy(begin, 0.1, limits)
     while not search.stop():
         tried = search.ask()
@@ -406,16 +381,15 @@ class Way(NamedTuple):
     module: str | None = None
 
 
-SYSID = "absl"  # that alone is missing where MuJoCo is there without its sysid
-
+# "absl" alone is missing where MuJoCo is there without its sysid.
 WAYS = {
     "as documented": Way(lambda given: Learned(given.model)),
     "adapter gap": Way(gap),
     "adapter replay": Way(online),
     "least squares": Way(least_squares),
     "figaroh": Way(figaroh, "figaroh"),
-    "mujoco.sysid, all free": Way(sysid_all, SYSID),
-    "mujoco.sysid, gap's list": Way(sysid_told, SYSID),
+    "mujoco.sysid, all free": Way(partial(by_sysid, False), "absl"),
+    "mujoco.sysid, gap's list": Way(partial(by_sysid, True), "absl"),
     "CMA-ES, as PACE": Way(evolution, "cma"),
 }
 
@@ -426,8 +400,9 @@ def of_this_process() -> dict[str, float]:
     return {"cpu_s": time.process_time(), "peak_mb": int(peak[1]) / 1024 if peak else math.nan}
 
 
-def main(path: Path) -> None:
+def main(file: str) -> None:
     """Do what a file asks for (a way's name, what it is told); then it holds the answer."""
+    path = Path(file)
     name, given = pickle.loads(path.read_bytes())
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

@@ -16,6 +16,7 @@ from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.discovery import UNSEEN_BASE, Discovery, discover
+from adapter.experiments.results import Stated
 from adapter.learning.learner import OnlineLearner
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -62,13 +63,9 @@ def shuffled(log: Log, tree: Tree, rng: np.random.Generator) -> Shuffled:
         (joint[name], link[moved], parent)
         for name, moved, parent in zip(tree.joint_names, tree.link_names, parents, strict=True)
     )
-    mixed = replace(
-        log.select(joints, links),
-        joint_names=tuple(joint.values()),
-        link_names=tuple(link.values()),
-        metadata={},
-    )
-    return Shuffled(mixed, edges, root)
+    mixed, joint_names = log.select(joints, links), tuple(joint.values())
+    told = replace(mixed, joint_names=joint_names, link_names=tuple(link.values()), metadata={})
+    return Shuffled(told, edges, root)
 
 
 def judged(asked: Shuffled, found: Discovery) -> dict[str, Any]:
@@ -107,6 +104,18 @@ def topology_trials(logs: Iterable[Log], tree: Tree, seed: int) -> dict[str, Any
     }
 
 
+def found_trees(trials: dict[str, Any]) -> Stated:
+    """Of how many recordings discovery found the whole tree, beside the paper."""
+    return Stated(
+        "discover",
+        "N and A unknown: trees found",
+        "future work",
+        f"{trials['right']} of {trials['trials']}" if trials["trials"] else None,
+        "",
+        f"from at most {trials['motion_s']:.1f} s; links and joints shuffled and renamed",
+    )
+
+
 def fall_logs(noisy: FallData, count: int) -> Iterator[Log]:
     """What joints, gyroscopes and accelerometers of falling robots say, one log per fall.
 
@@ -116,23 +125,15 @@ def fall_logs(noisy: FallData, count: int) -> Iterator[Log]:
     for k in range(min(count, len(noisy))):
         measured = noisy[k]
         q = measured["q"]
-        turning, pull = (
+        w, a = (
             np.concatenate([measured[f"base_{x}"][:, None], measured[f"link_{x}"]], axis=1)
-            for x in ("w", "a")
+            for x in "wa"
         )
-        nothing = np.full_like(turning, np.nan)
-        log = Log(
-            Path(f"fall {k}"),
-            tuple(truth.joint_names),
-            np.arange(len(q)) * round(1e9 / RATE_HZ),
-            q,
-            measured["dq"],
-            measured["tau"],
-            (truth.base_name, *truth.link_names),
-            np.concatenate([nothing, turning], axis=2),
-            np.concatenate([pull, nothing], axis=2),
-        )
-        yield _first(log)
+        nothing = np.full_like(w, np.nan)
+        twists, accels = np.concatenate([nothing, w], axis=2), np.concatenate([a, nothing], axis=2)
+        joints = np.arange(len(q)) * round(1e9 / RATE_HZ), q, measured["dq"], measured["tau"]
+        names, links = tuple(truth.joint_names), (truth.base_name, *truth.link_names)
+        yield _first(Log(Path(f"fall {k}"), names, *joints, links, twists, accels))
 
 
 def panda_moves(
@@ -164,19 +165,12 @@ def panda_logs(count: int, seed: int) -> Iterator[Log]:
     for k in range(seed, seed + count):
         world = build("bent_link", k)
         arm, samples, _ = panda_moves(world, robot, MOTION_S, PipelineSettings())
+        keys, path = ("stamp_ns", "q", "dq", "tau"), Path("simulated Panda")
+        stamps, q, dq, tau = (np.array([getattr(x, key) for x in samples]) for key in keys)
         links = [sample.links for sample in samples if sample.links is not None]
-        log = Log(
-            Path("simulated Panda"),
-            arm.joint_names,
-            np.array([sample.stamp_ns for sample in samples]),
-            np.array([sample.q for sample in samples]),
-            np.array([sample.dq for sample in samples]),
-            np.array([sample.tau for sample in samples]),
-            arm.link_names,
-            np.array([motion.twist for motion in links]),
-            np.array([motion.accel for motion in links]),
-        )
-        yield _first(log)
+        twists, accels = (np.array([getattr(x, key) for x in links]) for key in ("twist", "accel"))
+        names, links_of = arm.joint_names, arm.link_names
+        yield _first(Log(path, names, stamps, q, dq, tau, links_of, twists, accels))
 
 
 def _first(log: Log) -> Log:

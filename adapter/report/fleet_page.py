@@ -26,7 +26,6 @@ from adapter.runs.fleet.course import Drift
 from adapter.runs.fleet.fleet import Fleet
 
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
-FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 MOST_ROWS = 300  # of recordings on the page; of more those to say something of
 MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording, as figures
@@ -34,28 +33,24 @@ MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording,
 
 def log_rows(arm: FleetArm, numbers: Iterable[int]) -> list[tuple[str, ...]]:
     """Recordings as rows under `HEADS`, by their numbers."""
-    names = called(arm)
-    return [(names[k], *_log_cells(arm.logs[k])) for k in numbers]
+    names, rows = called(arm), list[tuple[str, ...]]()
+    for k in numbers:
+        log, begin_s = arm.logs[k], arm.logs[k].moments.begin_s
+        worst, begins = int(np.argmax(log.rmse)), f"{begin_s:.1f} s"
+        if begin_s >= EPOCH_S:
+            begins = f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
+        load = "" if log.load is None else _signed(*log.load)
+        fit = f"{log.rmse[worst]:.3f} ({worst + 1})"
+        few = len(log.disagrees) < 4  # joints to be named in a table
+        others = " ".join(map(str, log.disagrees)) if few else "everywhere"
+        cells = begins, f"{log.moments.span_s:.0f}", load, fit, _less(log.worth), others
+        rows.append((names[k], *cells))
+    return rows
 
 
 def called(arm: FleetArm) -> list[str]:
     """Names of an arm's recordings, with folders where two files have the same."""
     return names_of([log.moments.path for log in arm.logs])
-
-
-def _log_cells(log: OfLog) -> tuple[str, ...]:
-    worst, begin_s = int(np.argmax(log.rmse)), log.moments.begin_s
-    begins = f"{begin_s:.1f} s"
-    if begin_s >= EPOCH_S:
-        begins = f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
-    return (
-        begins,
-        f"{log.moments.span_s:.0f}",
-        "" if log.load is None else _signed(*log.load),
-        f"{log.rmse[worst]:.3f} ({worst + 1})",
-        _less(log.worth),
-        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
-    )
 
 
 def to_be_shown(arm: FleetArm, most: int) -> list[int]:
@@ -167,19 +162,15 @@ def as_json(found: Fleet) -> dict[str, Any]:
 
 
 def _arm_json(arm: FleetArm) -> dict[str, Any]:
-    std = arm.outcome.effects_std
+    std, outs = arm.outcome.effects_std, arm.standing_out
+    values = zip(arm.effects, arm.outcome.effects, std, strict=False)
     return {
         "name": arm.name,
         "theta": arm.model.theta,
         "theta_std": arm.model.theta_std,
-        "effects": {
-            name: {"value": arm.outcome.effects[k], "std": std[k]}
-            for k, name in enumerate(arm.effects)
-        },
+        "effects": {name: {"value": value, "std": own} for name, value, own in values},
         "drifts": [asdict(x) for x in arm.drifts],
-        "standing_out": [
-            {**x._asdict(), "path": arm.logs[x.number].moments.path} for x in arm.standing_out
-        ],
+        "standing_out": [{**x._asdict(), "path": arm.logs[x.number].moments.path} for x in outs],
         "logs": [
             {
                 **{key: getattr(log.moments, key) for key in MOMENTS},
@@ -235,10 +226,8 @@ def _parameters(arm: FleetArm) -> Table:
         mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
         values = [with_doubt(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
         rows.append([name, with_doubt(*mass), *values])
-    note = (
-        "A mass without a standard deviation is the documentation's: torques show it in sums only."
-    )
-    return Table(heads, rows, units, note)
+    said = "A mass without a standard deviation is the documentation's"
+    return Table(heads, rows, units, f"{said}: torques show it in sums only.")
 
 
 def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:

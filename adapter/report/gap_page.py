@@ -110,9 +110,8 @@ def _tiles(result: GapResult) -> list[Tile]:
     before, after = result.before, result.after
     noise = np.asarray(result.noise_floor_nm, dtype=float)
     left = len(result.unexplained)
-    said = f"{left} thing{'' if left == 1 else 's'} unexplained"
-    if not left:
-        said = words.left_above_noise(result) or "nothing above the noise left"
+    said = words.left_above_noise(result) or "nothing above the noise left"
+    said = f"{left} thing{'' if left == 1 else 's'} unexplained" if left else said
     tiles = [Tile("Effects found", str(len(words.by_kind(result.findings))), said)]
     worst = words.worst_joint(result)
     if worst is not None:
@@ -174,8 +173,7 @@ def _scored(result: GapResult) -> Check:
     if result.in_sample:
         said = "in sample only: nothing could be held out, so that errors after may be too small"
         return Check(LOOK, "On data not fitted", said)
-    lost = words.worse(result)
-    said = "errors before and after are of data that the fit never saw"
+    lost, said = words.worse(result), "errors before and after are of data that the fit never saw"
     said += f"; {lost}" if lost else ""
     return Check(LOOK if lost else GOOD, "On data not fitted", said)
 

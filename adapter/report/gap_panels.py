@@ -55,12 +55,9 @@ def error_panels(result: GapResult) -> list[Panel]:
     before, after = result.before, result.after
     panels = []
     if _any(before.torque_rmse_nm):
-        drawing = fall_drawing(
-            before.torque_rmse_nm, after.torque_rmse_nm, result.noise_floor_nm, result.joint_names
-        )
-        panels.append(
-            drawing.panel("Torque error by joint", result.unit("N m rms"), "inverse dynamics")
-        )
+        errors = before.torque_rmse_nm, after.torque_rmse_nm, result.noise_floor_nm
+        drawing, unit = fall_drawing(*errors, result.joint_names), result.unit("N m rms")
+        panels.append(drawing.panel("Torque error by joint", unit, "inverse dynamics"))
     if before.rollout_rmse_rad is not None and _any(before.rollout_rmse_rad):
         rollout = after.rollout_rmse_rad
         end = np.full(len(before.rollout_rmse_rad), np.nan) if rollout is None else rollout
@@ -82,9 +79,8 @@ def fall_drawing(before: Array, after: Array, noise: Array | None, names: Sequen
     ax.set_yscale("log")
     for j, (first, last) in enumerate(zip(before, after, strict=True)):
         if noise is not None and noise[j] > 0.0:
-            ax.plot(
-                [j - 0.3, j + 0.3], [noise[j]] * 2, color=MUTED, linewidth=1.4, gid=named("noise")
-            )
+            level = [j - 0.3, j + 0.3], [noise[j]] * 2
+            ax.plot(*level, color=MUTED, linewidth=1.4, gid=named("noise"))
         if not (np.isfinite(first) and first > 0.0):
             continue
         name = names[j]
@@ -160,19 +156,15 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
                 _law(cloud.axes[0], finding)
             called = ", ".join(f.title for f in laws)
             clouds.append(cloud.panel(title, result.unit("N m", j), called))
-        why = [result.joint_names[j]]
-        said = [
-            f.title for f in result.findings if j + 1 in f.joints or _worst(f.torque_rms_nm) == j
-        ]
+        said = []
+        for f in result.findings:
+            worst = np.argmax(np.nan_to_num(f.torque_rms_nm)) if np.size(f.torque_rms_nm) else -1
+            said += [f.title] if j + 1 in f.joints or worst == j else []
         said += ["something unexplained"] * any(x.joint == j + 1 for x in result.unexplained)
-        why += [", ".join(dict.fromkeys(said))] if said else []
+        why = filter(None, (result.joint_names[j], ", ".join(dict.fromkeys(said))))
         times = [_over_time(result, j), _motion(result, j)]
         panels.append(JointPanels(f"Joint {j + 1}", "; ".join(why), clouds, times))
     return panels
-
-
-def _worst(worth: Array) -> int:
-    return int(np.argmax(np.nan_to_num(worth))) if np.size(worth) else -1
 
 
 def _clouds(
@@ -238,10 +230,8 @@ def _dots(ax: Axes, x: Array, y: Array, color: str) -> None:
     points = np.repeat(np.column_stack([x[keep], y[keep]]), 2, axis=0)
     path = Path(points, np.tile([Path.MOVETO, Path.LINETO], len(keep)))
     path.should_simplify = False
-    patch = PathPatch(
-        path, facecolor="none", edgecolor=color, linewidth=1.8, alpha=0.45, capstyle="round"
-    )
-    ax.add_patch(patch)
+    look = {"facecolor": "none", "edgecolor": color, "capstyle": "round"}
+    ax.add_patch(PathPatch(path, linewidth=1.8, alpha=0.45, **look))
 
 
 def _running_mean(x: Array, y: Array) -> tuple[Array, Array]:
@@ -314,10 +304,8 @@ def rollout_drawing(rollout: RolloutCurves, j: int, start: float, stop: float) -
         below.set_ylim(-1.1 * worst, 1.1 * worst)
     below.set_ylabel("mrad off")  # for the pointer; drawn inside, where long numbers leave room
     below.yaxis.label.set_visible(False)
-    size = SIZES["half"][2]
-    below.text(
-        0.01, 0.95, "mrad off", transform=below.transAxes, color=MUTED, fontsize=size, va="top"
-    )
+    axes, size = below.transAxes, SIZES["half"][2]
+    below.text(0.01, 0.95, "mrad off", transform=axes, color=MUTED, fontsize=size, va="top")
     below.set_xlim(start, stop)
     time_axis(drawing, "time, s")
     return drawing

@@ -159,10 +159,8 @@ def error_table(result: GapResult) -> Table:
     units = ["", own, *[f"torque, {own}"] * 2, *["× noise"] * 2]
     noise = np.asarray(result.noise_floor_nm, dtype=float)
     columns = [noise, before.torque_rmse_nm, after.torque_rmse_nm, *words.noise_times(result)]
-    for unit, key in (
-        ("rollout, mrad", "rollout_rmse_rad"),
-        ("rollout, mrad/s", "rollout_rmse_rad_s"),
-    ):
+    rollouts = ("rollout, mrad", "rollout_rmse_rad"), ("rollout, mrad/s", "rollout_rmse_rad_s")
+    for unit, key in rollouts:
         pair = getattr(before, key), getattr(after, key)
         if all(x is None or not np.isfinite(x).any() for x in pair):
             continue

@@ -67,14 +67,13 @@ def schema_panels(data: RunData) -> list[Panel]:
     shown = "" if until == t[-1] else f"; the first {until:.2g} of {t[-1]:.3g} s"
     note = f"in its parent's, x solid, y dashed, z dotted{shown}"
     turns, shifts = rotation_path(values), values[..., 3:]
-    panels = [
-        _components(early, turns, converged).panel(
-            "Orientation of the joint frames", "rad", f"rotation vector of each frame {note}"
-        ),
-        _components(early, shifts, converged).panel(
-            "Position of the joint frames", "m", f"origin of each frame {note}"
-        ),
-    ]
+    panels = []
+    for what, unit, told, path in (
+        ("Orientation", "rad", "rotation vector", turns),
+        ("Position", "m", "origin", shifts),
+    ):
+        drawing, told = _components(early, path, converged), f"{told} of each frame {note}"
+        panels.append(drawing.panel(f"{what} of the joint frames", unit, told))
     if data.reference is None:
         return panels
     goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")

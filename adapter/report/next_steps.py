@@ -15,7 +15,6 @@ from adapter.report.worth import SLOW, Worth, slow_share
 from adapter.runs.run_folder import RunData
 
 MOST = 4
-LEARNED_SHARE = 0.7  # of a recording that is learned from where the rest is held out
 LONGER = 2.0  # times the duration of a run that was too short
 SIMULATED = "pybullet"
 # Options that make a recording readable, which whoever reads it next needs, too
@@ -48,12 +47,9 @@ def next_steps(data: RunData, worth: Worth) -> list[Step]:
     started = theta_started(data)
     found: list[Step | None] = []
     fall, slow = worth.torque, slow_share(data) if started else None
-    if (
-        (fall is not None and (fall.before is None or fall.better))
-        or not_learned(data.figures)
-        or worth.loads
-        or (slow is not None and float(slow.max()) > SLOW)
-    ):
+    lacks = fall is not None and (fall.before is None or fall.better)
+    left = slow is not None and float(slow.max()) > SLOW
+    if lacks or left or worth.loads or not_learned(data.figures):
         found.append(files.gap("Name what the documented model lacks, with its evidence"))
     if not started or data.figures["theta"].get("converged_s") is None:
         found.append(_longer(data, files))
@@ -164,21 +160,19 @@ def _feedforward(data: RunData, worth: Worth) -> Step | None:
 
 def _held_out(data: RunData, files: _Files) -> Step | None:
     """Nothing was held out."""
-    span_s = _seconds(data)
-    one = len(files.logs) == 1
-    if data.figures["theta"].get("validation_torque_rmse_nm") or not one or not span_s:
+    span_s, held_out = _seconds(data), data.figures["theta"].get("validation_torque_rmse_nm")
+    if held_out or len(files.logs) != 1 or not span_s:
         return None
-    at = f"{LEARNED_SHARE * span_s:.3g}"
+    at = f"{0.7 * span_s:.3g}"  # seven tenths are learned from
     why = "Judge the model on data that it never saw"
     return files.read(why, "replay", files.logs, "--validate-from", at)
 
 
 def _use(data: RunData, files: _Files) -> list[Step]:
     """What the learned model is for."""
-    source = data.model.source
-    mjcf = source is not None and source.format == MJCF
+    mjcf = data.model.source is not None and data.model.source.format == MJCF
     target = ("--mjcf", "learned.xml") if mjcf else ("--urdf", "learned.urdf")
     see = "See joint by joint what differs from the documentation"
     use = "Use it in a simulator or planner: the robot's file with what was learned"
-    exported = command("export", files.model, *target)
-    return [Step(see, command("diff", files.model)), Step(use, exported)]
+    both = command("diff", files.model), command("export", files.model, *target)
+    return [Step(see, both[0]), Step(use, both[1])]

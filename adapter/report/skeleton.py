@@ -46,14 +46,13 @@ class Skeleton:
 def skeleton_panels(data: RunData) -> list[Panel]:
     """The arm as initial, learned, documented (and true) λ have it, from three sides."""
     q = posture(data)
-    reference = data.documented.lam if data.reference is None else data.reference
     arms = {
         "documented": placed_arm(data, data.documented.lam, q),
         "initial": replace(placed_arm(data, data.start_lam, q), tips={}),  # all in one place
         "learned": placed_arm(data, data.model.lam, q),
     }
-    if has_reference(data):
-        arms["reference"] = placed_arm(data, reference, q)
+    if data.reference is not None and has_reference(data):
+        arms["reference"] = placed_arm(data, data.reference, q)
     views: tuple[tuple[str, Projection, str], ...] = (
         ("Seen from a corner", from_a_corner, "short ticks are the joint axes"),
         ("Seen from the side", lambda points: points[..., [0, 2]], "x to the right, z up"),

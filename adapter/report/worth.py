@@ -281,10 +281,9 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
         if torque.size is not None:
             columns.append(("Torque that acted", unit, [number(x) for x in torque.size]))
         if torque.before is not None:
-            before = _values(torque.before, torque.before_std)
-            columns.append(("Error, documented model", unit, before))
-        after = _values(torque.after, torque.after_std)
-        columns.append(("Error, learned model", unit, after))
+            told = _values(torque.before, torque.before_std)
+            columns.append(("Error, documented model", unit, told))
+        columns.append(("Error, learned model", unit, _values(torque.after, torque.after_std)))
         if torque.before is not None:
             shares = 100.0 * (torque.after / np.maximum(torque.before, 1e-12) - 1.0)
             changes = [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]
@@ -304,10 +303,8 @@ def _values(values: Any, std: Any = None) -> list[str]:
 
 def worth_panels(data: RunData, worth: Worth) -> list[Panel]:
     """Errors of every joint before and after, where both are known."""
-    panels = []
-    torque, tracking = worth.torque, worth.tracking
-    tree = data.documented.tree
-    names = tree.joint_names
+    panels, torque, tracking = [], worth.torque, worth.tracking
+    tree, names = data.documented.tree, data.documented.tree.joint_names
     if torque is not None and torque.before is not None:
         drawing = fall_drawing(torque.before, torque.after, None, names)
         unit = f"{tree.unit('N m', 'N')} rms"
@@ -315,6 +312,5 @@ def worth_panels(data: RunData, worth: Worth) -> list[Panel]:
     if tracking is not None and tracking.before is not None:
         drawing = fall_drawing(1e3 * tracking.before, 1e3 * tracking.after, None, names)
         note = f"feedback alone, and with the feed-forward of the {tracking.seen}"
-        off = f"{tree.unit('mrad', 'mm')} rms"
-        panels.append(drawing.panel("Path error by joint", off, note))
+        panels.append(drawing.panel("Path error by joint", f"{tree.unit('mrad', 'mm')} rms", note))
     return panels

@@ -128,6 +128,8 @@ class Messages:
 
     def _frame(self, now: Now) -> Message:
         view, push = now.view, now.view.push
+        shown = {"push": "torque", "push_std": "torque_std"}
+        shown |= {key: key for key in ("wrench", "wrench_std")}
         return {
             "t": round(now.t_s, 3),
             "headline": now.headline,
@@ -138,17 +140,10 @@ class Messages:
             "samples": view.samples,
             "waiting": view.waiting,
             "learned": 0 if view.snapshot is None else view.snapshot.learned,
-            "q": numbers(now.q),
-            "tau": numbers(now.tau),
-            "residual": numbers(now.residual),
-            "rms": numbers(now.rms),
-            "noise": numbers(now.noise),
+            **{key: numbers(getattr(now, key)) for key in ("q", "tau", "residual", "rms", "noise")},
             "words": now.joint_states,
             "contact": now.contact,
-            "push": None if push is None else numbers(push.torque),
-            "push_std": None if push is None else numbers(push.torque_std),
-            "wrench": None if push is None else numbers(push.wrench),
-            "wrench_std": None if push is None else numbers(push.wrench_std),
+            **{key: push and numbers(getattr(push, x)) for key, x in shown.items()},
             "push_learned": push is not None and push.learned,
             "arms": self._arms(now),
         }
@@ -161,10 +156,8 @@ class Messages:
         placed = {"documented": (matrix_from_zxz(arm.lam[:, :3]), arm.lam[:, 3:])}
         if now.frames is not None:
             placed["learned"] = now.frames.R, now.frames.p
-        return {
-            name: _points(skeleton_of(arm.tree, *frames, now.q, arm.frames))
-            for name, frames in placed.items()
-        }
+        both = {k: skeleton_of(arm.tree, *x, now.q, arm.frames) for k, x in placed.items()}
+        return {name: _points(skeleton) for name, skeleton in both.items()}
 
     def _estimate(self, now: Now) -> Message:
         snapshot, frames = now.view.snapshot, now.frames

@@ -10,18 +10,13 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
+from adapter.cli.diff import difference_json, difference_matrix, difference_summary, effect_rows
 from adapter.errors import ModelError
 from adapter.model.locking import locked
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
 from adapter.model.spatial import exp_rotation, zxz_from_matrix
-from adapter.report.difference_words import (
-    difference_json,
-    difference_matrix,
-    difference_summary,
-    effect_rows,
-)
 from adapter.runs.compare import Change, ModelDifference, compare, documentation_of
 
 PANDA = documented("panda")

@@ -66,40 +66,20 @@ def contenders(
     """
     # what is cut down where the full size is not asked for; everything else is as in the paper
     epochs, members, steps = (200, MEMBERS, 30_000) if full else (40, 20, 6_000)
+    network = partial(FeedForward, epochs=epochs, seed=seed)
+    rates = tuple({"rate": rate} for rate in (1e-3, 2e-3, 4e-3))
+    committee = partial(ElmCommittee, members=members, seed=seed)
     pairs = product((0.1, 0.2, 0.3), (1e-9, 1e-7))
+    units = tuple({"spread": spread, "ridge": ridge} for spread, ridge in pairs)
+    process, by_hand = partial(GaussianProcess, seed=seed), "Nothing chosen by hand."
+    lagrangian = partial(DeepLagrangian, columns, steps=steps, seed=seed)
+    squares = partial(RegressorLeastSquares, columns, parents, lam)
     return (
-        Choice(
-            "FFNN",
-            "Feed-forward network",
-            partial(FeedForward, epochs=epochs, seed=seed),
-            tuple({"rate": rate} for rate in (1e-3, 2e-3, 4e-3)),
-            {"epochs": 4},
-        ),
-        Choice(
-            "ELM",
-            "Committee of extreme learning machines",
-            partial(ElmCommittee, members=members, seed=seed),
-            tuple({"spread": spread, "ridge": ridge} for spread, ridge in pairs),
-            {"members": 1},
-        ),
-        Choice(
-            "GPR",
-            "Gaussian process regression",
-            partial(GaussianProcess, seed=seed),
-            otherwise="Nothing chosen by hand.",
-        ),
-        Choice(
-            "DeLaN",
-            "Deep Lagrangian network",
-            partial(DeepLagrangian, columns, steps=steps, seed=seed),
-            tuple({"rate": rate} for rate in (1e-3, 2e-3)),
-            {"steps": 600},
-        ),
-        Choice(
-            "WLS",
-            "Least squares, known body schema",
-            partial(RegressorLeastSquares, columns, parents, lam),
-        ),
+        Choice("FFNN", "Feed-forward network", network, rates, {"epochs": 4}),
+        Choice("ELM", "Committee of extreme learning machines", committee, units, {"members": 1}),
+        Choice("GPR", "Gaussian process regression", process, otherwise=by_hand),
+        Choice("DeLaN", "Deep Lagrangian network", lagrangian, rates[:2], {"steps": 600}),
+        Choice("WLS", "Least squares, known body schema", squares),
     )
 
 
@@ -120,10 +100,8 @@ def arm_tables(
     sets = {}
     for name, pairs in found.items():
         xs, ys = zip(*pairs, strict=True)
-        sets[name] = np.concatenate(xs), np.concatenate(ys)
-    order = np.argsort(np.argsort(parts.train))
-    x, y = sets["train"]
-    sets["train"] = x[order], y[order]
+        order = np.argsort(np.argsort(parts.train)) if name == "train" else slice(None)
+        sets[name] = np.concatenate(xs)[order], np.concatenate(ys)[order]
     return sets
 
 
@@ -243,12 +221,10 @@ class Errors:
         for name in SETS:
             if not self._relative[name]:
                 continue
-            table = np.concatenate(self._relative[name])
-            columns = [column[~np.isnan(column)] for column in table.T]
+            columns = [x[~np.isnan(x)] for x in np.concatenate(self._relative[name]).T]
             nothing = np.full(len(BOX_PERCENTILES), np.nan)
-            learned.boxes[name] = np.array(
-                [np.percentile(x, BOX_PERCENTILES) if len(x) else nothing for x in columns]
-            )
+            boxes = [np.percentile(x, BOX_PERCENTILES) if len(x) else nothing for x in columns]
+            learned.boxes[name] = np.array(boxes)
             every = np.concatenate(columns)
             learned.median[name], learned.p99[name] = map(float, np.percentile(every, (50, 99)))
             learned.rmse[name] = np.sqrt(self._square[name] / max(self._count[name], 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 from scipy import linalg, optimize
@@ -212,15 +213,9 @@ class GaussianProcess(ScaledBaseline):
         """Length scales (width,) and share of noise where the marginal likelihood is highest."""
         start = np.append(np.full(x.shape[1], np.log(np.sqrt(x.shape[1]))), np.log(1e-4))
         bounds = [tuple(np.log(LENGTHS))] * x.shape[1] + [tuple(np.log(NOISES))]
-        found = optimize.minimize(
-            negative_log_likelihood,
-            start,
-            (x, y),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": self.steps},
-        )
+        how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": bounds}
+        how["options"] = {"maxiter": self.steps}
+        found = optimize.minimize(negative_log_likelihood, start, (x, y), **how)
         return np.exp(found.x[:-1]), float(np.exp(found.x[-1]))
 
     def _answer_scaled(self, x: Array) -> Array:

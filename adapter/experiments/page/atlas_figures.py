@@ -16,8 +16,7 @@ from matplotlib.ticker import LogLocator
 
 from adapter.experiments.falls import SETS
 from adapter.experiments.page.words import LETTERS, OURS, grouped, with_unit
-from adapter.experiments.results import AtlasResults, LearnerScores
-from adapter.experiments.stated import PAPER_BASELINES
+from adapter.experiments.results import PAPER_BASELINES, AtlasResults, LearnerScores
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
@@ -155,14 +154,8 @@ def fit_to(drawing: style.Drawing, shown: Sequence[Skeleton]) -> None:
     scale = fits[-1] if fits else SCALES_M[0]
     left, foot = x - 0.97 * ratio * half, y - 0.95 * half
     ax.plot([left, left + scale], [foot, foot], color=style.MUTED, linewidth=1.4)
-    ax.text(
-        left + scale + 0.03 * half,
-        foot,
-        f"{scale:g} m",
-        color=style.MUTED,
-        va="center",
-        fontsize=text,
-    )
+    left += scale + 0.03 * half
+    ax.text(left, foot, f"{scale:g} m", color=style.MUTED, va="center", fontsize=text)
 
 
 def histogram_panels(atlas: AtlasResults) -> tuple[style.Panel, style.Panel]:
@@ -170,11 +163,9 @@ def histogram_panels(atlas: AtlasResults) -> tuple[style.Panel, style.Panel]:
     error, edges = "errors |k − k̂|", atlas.error_edges
     on = f"the {grouped(atlas.numbers['learned_samples'])} samples"
     note = f"λ of (d), from mini-batches, on {on} it learned from"
-    beside = "on the same samples; “FOPnet, moments” takes this λ"
-    return (
-        _histogram(edges, atlas.error_counts, f"(f) Kinematic {error}", note),
-        _histogram(edges, atlas.moments_error_counts, f"λ from moments: {error}", beside),
-    )
+    own = _histogram(edges, atlas.error_counts, f"(f) Kinematic {error}", note)
+    note = "on the same samples; “FOPnet, moments” takes this λ"
+    return own, _histogram(edges, atlas.moments_error_counts, f"λ from moments: {error}", note)
 
 
 def _histogram(edges: Array, by_kind: Mapping[str, Array], title: str, note: str) -> style.Panel:
@@ -210,11 +201,8 @@ def schema_panels(atlas: AtlasResults) -> list[style.Panel]:
     good = np.isfinite(cost) & (cost > 0.0)
     drawing = style.Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
-    ax.plot(
-        *style.thin(np.flatnonzero(good).astype(float), cost[good]),
-        color=style.ACCENT,
-        linewidth=1.2,
-    )
+    line = style.thin(np.flatnonzero(good).astype(float), cost[good])
+    ax.plot(*line, color=style.ACCENT, linewidth=1.2)
     style.log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
     ax.set_xlim(0.0, 1.04 * len(cost))
     style.time_axis(drawing, "step of the optimiser")
@@ -315,7 +303,7 @@ def side_by_side(atlas: AtlasResults) -> style.Panel | None:
     ax = drawing.axes[0]
     for k, learner in enumerate(atlas.learners):
         for side, name in zip((-0.2, 0.0, 0.2), SETS, strict=True):
-            errors = np.array([learner.median[name], learner.p99[name]])
+            errors = learner.median[name], learner.p99[name]
             middle, high = PERCENT * np.maximum(errors, SMALLEST)
             color = style.STAND_IN[SET_NAMES[name]]
             ax.plot([k + side] * 2, [middle, high], color=color, linewidth=2.0, alpha=0.45)

@@ -12,8 +12,7 @@ from matplotlib.axes import Axes
 from adapter.experiments.falls import SETS
 from adapter.experiments.page import atlas_figures as figures
 from adapter.experiments.page import words
-from adapter.experiments.results import AtlasResults, PandaResults, Stated
-from adapter.experiments.stated import PAPER_BASELINES
+from adapter.experiments.results import PAPER_BASELINES, AtlasResults, PandaResults, Stated
 from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.numbers import DASH
@@ -110,9 +109,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
     tuning = [(x.name, x.title.rstrip("."), words.sentences(x.tuning)) for x in atlas.learners]
     return {
         "n": atlas.tree.n,
-        "limbs": [
-            (limb.color % style.JOINT_COLORS + 1, limb.name) for limb in figures.limbs(atlas.tree)
-        ],
+        "limbs": [(x.color % style.JOINT_COLORS + 1, x.name) for x in figures.limbs(atlas.tree)],
         "schema": [*figures.epoch_panels(atlas), histogram],
         "schema_more": [moments, *figures.schema_panels(atlas)],
         "not_converged": _not_converged(atlas),
@@ -215,11 +212,8 @@ Line = tuple[str, Array, str]  # name, values, colour
 
 def beyond(atlas: AtlasResults | None, panda: PandaResults | None) -> dict[str, Any] | None:
     """Tables and panels of the section; None where neither was run."""
-    robots = [
-        (name, results.numbers["discover"])
-        for name, results in (("ATLAS", atlas), ("Panda", panda))
-        if results is not None and results.numbers["discover"]["trials"]
-    ]
+    ran = {name: x.numbers["discover"] for name, x in (("ATLAS", atlas), ("Panda", panda)) if x}
+    robots = [(name, found) for name, found in ran.items() if found["trials"]]
     online = {} if atlas is None else atlas.numbers["online"]
     if not robots and not online:
         return None
@@ -235,29 +229,22 @@ def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
     if not robots:
         return None
     trials = [found for _, found in robots]
-    wrong = [found["most_confidence_wrong"] for found in trials]
-    rows: list[tuple[str, list[str]]] = [
-        ("trees found, every edge right", [f"{x['right']} of {x['trials']}" for x in trials]),
-        ("least confidence in a right edge", [_share(x["least_confidence_right"]) for x in trials]),
-        (
-            "most confidence in a wrong edge",
-            [_share(x) if x > 0.0 else "none was reported" for x in wrong],
-        ),
-        ("longest recording", [words.with_unit(x["motion_s"], "s", 3) for x in trials]),
-        (
-            "measured on every link",
-            [
-                listed([figures.KINDS[kind][0] for kind in x["measured"].split(", ")])
-                for x in trials
-            ],
-        ),
+    wrong = [found["most_confidence_wrong"] or None for found in trials]
+    kinds = ([figures.KINDS[kind][0] for kind in x["measured"].split(", ")] for x in trials)
+
+    def share(confidence: float | None) -> str:  # never rounded up to certainty
+        if confidence is None:
+            return "none was reported"
+        return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
+
+    rows = [
+        ["trees found, every edge right", *(f"{x['right']} of {x['trials']}" for x in trials)],
+        ["least confidence in a right edge", *(share(x["least_confidence_right"]) for x in trials)],
+        ["most confidence in a wrong edge", *map(share, wrong)],
+        ["longest recording", *(words.with_unit(x["motion_s"], "s", 3) for x in trials)],
+        ["measured on every link", *map(listed, kinds)],
     ]
-    return Table(["", *(name for name, _ in robots)], [[what, *cells] for what, cells in rows])
-
-
-def _share(confidence: float) -> str:
-    """Never rounded up to certainty."""
-    return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
+    return Table(["", *(name for name, _ in robots)], rows)
 
 
 def online_table(online: Mapping[str, Any]) -> Table | None:
@@ -286,22 +273,16 @@ def online_panels(history: Sequence[Mapping[str, float]]) -> list[style.Panel]:
         return []
     over = {key: np.array([row[key] for row in history]) for key in history[0]}
     t = over["seconds"]
-    ratios: list[Line] = [
-        ("all joints", over["over_least_squares"], style.ACCENT),
-        ("worst joint", over["worst_joint_over_least_squares"], style.MUTED),
-    ]
-    errors: list[Line] = [
-        ("turn, rad", over["turn_rad"], style.ACCENT),
-        ("shift, m", over["shift_m"], style.GOAL),
-    ]
+    worst = "worst joint", over["worst_joint_over_least_squares"], style.MUTED
+    every = "all joints", over["over_least_squares"], style.ACCENT
+    ratios = _plot(t, [every, worst], TORQUE_GOAL)
+    shift = "shift, m", over["shift_m"], style.GOAL
+    errors = _plot(t, [("turn, rad", over["turn_rad"], style.ACCENT), shift], None)
     note = "on a motion never learned from; 1 is least squares on all samples seen so far"
+    far = "of the joint whose frame is farthest off"
     return [
-        _plot(t, ratios, TORQUE_GOAL).panel(
-            "ATLAS online: torque error", "times batch least squares", note
-        ),
-        _plot(t, errors, None).panel(
-            "ATLAS online: error of λ", "rad, m", "of the joint whose frame is farthest off"
-        ),
+        ratios.panel("ATLAS online: torque error", "times batch least squares", note),
+        errors.panel("ATLAS online: error of λ", "rad, m", far),
     ]
 
 

@@ -8,8 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
-from adapter.experiments.stated import PAPER_BASELINES
+from adapter.experiments.results import (
+    PAPER_BASELINES,
+    AtlasResults,
+    LearnerScores,
+    PandaResults,
+    Stated,
+)
 from adapter.model.numbers import DASH
 from adapter.report.style import SUPERSCRIPTS
 from adapter.report.words import NARROW, count, number
