@@ -10,11 +10,7 @@ import numpy as np
 import pybullet as bullet
 
 from sim.effects import BODY, Effect
-from sim.truth import Array, Truth, body_of, theta_of, turn
-from sim.urdf_writer import principal, urdf
-
-NO_CAP = 1e6  # rad/s and m/s, in place of PyBullet's velocity cap of 100
-FLAT = 1e-6  # of the largest moment: so far below zero a principal moment may be by rounding
+from sim.truth import Array, Truth, body_of, principal, theta_of, turn, urdf
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +115,7 @@ def load_urdf(text: str, client: int, fixed: bool) -> int:
             angularDamping=0.0,
             jointDamping=0.0,
             lateralFriction=0.0,
-            maxJointVelocity=NO_CAP,
+            maxJointVelocity=1e6,  # in place of 100
             activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
             physicsClientId=client,
         )
@@ -147,7 +143,7 @@ def _checked(truth: Truth, j: int) -> Array:
     if not np.isfinite(truth.theta[j]).all() or not mass > 0.0:
         raise ValueError(f"{name} has a mass of {mass} kg; a simulated body needs mass above 0")
     moments, _ = principal(body_of(truth.theta[j])[2])
-    if moments.min() < -FLAT * max(moments.max(), 0.0) or moments.max() < 0.0:
+    if moments.min() < -1e-6 * max(moments.max(), 0.0) or moments.max() < 0.0:
         told = ", ".join(f"{moment:.3g}" for moment in moments)
         raise ValueError(
             f"{name} has principal moments of inertia of {told} kg m² about its centre; "
