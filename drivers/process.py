@@ -1,8 +1,12 @@
-"""A process of a driver's own, memory to share with it, signals that end one, waking in time."""
+"""A process of a driver's own, memory to share with it, signals that end one, waking in time.
+
+What a loop asks of the system is not demanded: each request says whether it was granted.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import mmap
 import os
 import signal
@@ -10,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
@@ -89,3 +93,49 @@ class StopSignals:
 def sleep_until(deadline_ns: int) -> None:
     """Sleep until CLOCK_MONOTONIC shows `deadline_ns`."""
     time.sleep(max(1e-9 * (deadline_ns - time.monotonic_ns()), 0.0))
+
+
+# One clear sentence on a request, and what takes back what was granted; None where nothing was.
+Answer = tuple[str, Callable[[], None] | None]
+
+
+def request_fifo(priority: int) -> Answer:
+    """SCHED_FIFO for the calling thread; its children start ordinary."""
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except (OSError, ValueError) as error:
+        why = "needs root, CAP_SYS_NICE or an rtprio limit (ulimit -r)"
+        return f"priority: SCHED_FIFO {priority} refused ({error}); {why}", None
+    line = f"priority: SCHED_FIFO {priority} granted"
+    return line, lambda: os.sched_setscheduler(0, *before)
+
+
+def pin(cores: set[int]) -> Answer:
+    """Keep the calling thread on these cores."""
+    before = os.sched_getaffinity(0)
+    names = ", ".join(map(str, sorted(cores)))
+    try:
+        os.sched_setaffinity(0, cores)
+    except (OSError, ValueError) as error:
+        have = ", ".join(map(str, sorted(before)))
+        return f"core: {names} refused ({error}); have: {have}", None
+    shared = " (the only one: the workers share it)" if before <= cores else ""
+    line = f"core: the loop runs on core {names}{shared}"
+    return line, lambda: os.sched_setaffinity(0, before)
+
+
+def quiet_collector() -> Answer:
+    """Collect once, then leave everything that lives alone and collect no more."""
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+    def undo() -> None:
+        gc.unfreeze()
+        if enabled:
+            gc.enable()
+
+    return "collector: frozen and off", undo

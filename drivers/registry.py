@@ -22,7 +22,6 @@ LOG = ".files.log:LogArm"  # takes (file, joint names)
 HARDWARE = {"fci": ".fci.arm:FciArm", "can": ".damiao.arm:DamiaoArm", "ros2": ".ros2.arm:Ros2Arm"}
 NAMELESS = ("can", "ros2")  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
-OWN = ".own:open_own"  # takes the same
 OWN_KIND = " or FILE.py:CLASS of your own"
 
 
@@ -77,7 +76,7 @@ def open_driver(
     if scheme == "log":
         return _load(LOG)(rest, joint_names)
     if is_own(scheme):
-        return _load(OWN)(address, joint_names, allow_motion)
+        return _load(".own:open_own")(address, joint_names, allow_motion)
     if scheme not in HARDWARE:
         raise DriverError(f"no driver '{scheme}'; {choices(scheme, SCHEMES, OWN_KIND)}")
     return _load(HARDWARE[scheme])(address, joint_names, allow_motion)

@@ -77,7 +77,6 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "x_floor": (OBSTACLE, ("height",), ()),
 }
 PAIRS = ("x_cross_viscous", "x_torque_crosstalk")  # joints [from, to]
-WITHOUT_JOINTS = ("signal_delay", "x_wall", "x_floor")
 LENGTHS = {"inertia": 6, "dtheta": 10}
 POSITIVE = {
     "joint_elasticity": "k",
@@ -212,7 +211,7 @@ def _check_keys(effect: Effect) -> None:
 def _check_joints(effect: Effect) -> None:
     """Raises ValueError for a wrong number of joints or joints that do not count from 1."""
     joints = effect.joints
-    whole = effect.place in (BODY, WRENCH) or effect.name in WITHOUT_JOINTS
+    whole = effect.place in (BODY, WRENCH) or effect.name in ("signal_delay", "x_wall", "x_floor")
     if any(j < 1 for j in joints):
         raise ValueError(f"{effect.name} is on joints {list(joints)}; they count from 1")
     if effect.name == "link_inertia" and len(joints) != 1:

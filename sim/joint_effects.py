@@ -26,7 +26,6 @@ from sim.effects import MOTION, OBSTACLE, SPECS, Effect
 from sim.truth import FLANGE, Array, Truth
 
 COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_WIDTH)
-NEWTON_ROUNDS = 8
 
 # Kinds of rows, one for each effect on a motion: kind, joint, other joint, three parameters in the
 # order of `SPECS`, start and end.
@@ -148,7 +147,7 @@ def step(M: Array, bias: Array, v: Array, h: float, parts: Array, drive: Array) 
         stiff = max(positive[i], negative[i], 0.0) / COULOMB_WIDTH * h / M[i, i]
         share[i] = max(0.5, 1.0 - 1.0 / max(stiff, 1.0))
     dv = np.zeros(n)
-    for _ in range(NEWTON_ROUNDS):
+    for _ in range(8):
         A = M / h
         for i in range(n):
             speed = v[i] + share[i] * dv[i]

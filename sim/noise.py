@@ -24,8 +24,6 @@ HIGH_HZ = 50.0  # "above 50 Hz"
 BAND_HZ = (10.0, 40.0)
 BLOCK = 16  # samples drawn at once: dear enough one by one, a hitch in the loop if many
 TAPS = 256  # samples after which the band filter has forgotten an input but for 2e-4
-POINTS = 1 << 14  # of the band filter's response, over the frequencies up to half the rate
-MOVING = 0.1  # rad/s, from here on a joint's torque noise is that of motion
 
 Draw = Callable[[np.random.Generator], Array]
 
@@ -76,7 +74,7 @@ class SensorNoise:
         tau, dq, q = self._joints.at(k)
         least = self._levels.tau_at_rest
         if least != 1.0:
-            tau = tau * (least + (1.0 - least) * np.minimum(np.abs(clean.dq) / MOVING, 1.0))
+            tau = tau * (least + (1.0 - least) * np.minimum(np.abs(clean.dq) / 0.1, 1.0))
         tau = clean.tau + tau
         on = self._quantised
         tau[on] = np.round(tau[on] / self._step[on]) * self._step[on]
@@ -138,7 +136,7 @@ class _JointNoise:
 
 def band_response() -> tuple[Array, NDArray[np.complex128]]:
     """Frequencies, Hz, and the response there of a Butterworth band-pass of second order."""
-    f = np.linspace(0.0, RATE_HZ / 2, POINTS + 1)
+    f = np.linspace(0.0, RATE_HZ / 2, (1 << 14) + 1)
     sections = butter(2, BAND_HZ, btype="bandpass", fs=RATE_HZ, output="sos")
     return f, np.asarray(sosfreqz(sections, f, fs=RATE_HZ)[1])
 

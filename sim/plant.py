@@ -17,10 +17,7 @@ from sim.sensors import Imus, Sensors
 from sim.truth import Array, Truth
 
 PERIOD_NS = round(PERIOD_S * 1e9)
-REFRESH_TICKS = 20  # a command counts for 20 ms of plant time, then the brakes close
-BRAKE_TIME_S = 0.02  # below the full deceleration, speed dies away with this time constant
 LOCK_RATE = 60.0  # 1/s, the critically damped hold
-RELEASE_TICKS = 100  # for which the arm only damps: what it leans on pushes it back meanwhile
 
 
 class Plant:
@@ -142,7 +139,7 @@ class Plant:
         self._k += 1
         if self._k > 0:
             self._age += 1
-            if self._age > REFRESH_TICKS:
+            if self._age > 20:  # 20 ms, then the brakes close
                 self.stop()
             end = self._brake() if self.braked else self._wanted
             self._engine.tick(self._drive, end)
@@ -166,11 +163,11 @@ class Plant:
         """Driving torque (n,) at the end of the next tick that slows down and then holds."""
         self._braked_ticks += 1
         still = np.abs(self._dq) < 0.01  # rad/s, a slower joint is held where it is
-        stopped = self._moving & still & (self._braked_ticks > RELEASE_TICKS)
+        stopped = self._moving & still & (self._braked_ticks > 100)  # pushed back until then
         self._lock[stopped] = self._q[stopped]
         self._moving &= ~stopped
         most = self.truth.limits.acceleration
-        slow = np.clip(-self._dq / BRAKE_TIME_S, -most, most)
+        slow = np.clip(-self._dq / 0.02, -most, most)  # s
         hold = LOCK_RATE**2 * (self._lock - self._q) - 2 * LOCK_RATE * self._dq
         return self._engine.drive_for(self._q, self._dq, np.where(self._moving, slow, hold))
 

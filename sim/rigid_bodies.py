@@ -10,11 +10,7 @@ import numpy as np
 import pybullet as bullet
 
 from sim.effects import BODY, Effect
-from sim.truth import Array, Truth, body_of, theta_of, turn
-from sim.urdf_writer import principal, urdf
-
-NO_CAP = 1e6  # rad/s and m/s, in place of PyBullet's velocity cap of 100
-FLAT = 1e-6  # of the largest moment: so far below zero a principal moment may be by rounding
+from sim.truth import Array, Truth, body_of, principal, theta_of, turn, urdf
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +106,7 @@ def load_urdf(text: str, client: int, fixed: bool) -> int:
         how = {"useFixedBase": fixed, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
         robot: int = bullet.loadURDF(str(path), **how, **within)
     lossy = "linearDamping", "angularDamping", "jointDamping", "lateralFriction"
-    bare = {**dict.fromkeys(lossy, 0.0), "maxJointVelocity": NO_CAP}
+    bare = {**dict.fromkeys(lossy, 0.0), "maxJointVelocity": 1e6}  # in place of 100 rad/s
     bare["activationState"] = bullet.ACTIVATION_STATE_DISABLE_SLEEPING
     count = bullet.getNumJoints(robot, **within)
     for link in range(-1, count):
@@ -134,7 +130,7 @@ def _checked(truth: Truth, j: int) -> Array:
     if not np.isfinite(truth.theta[j]).all() or not mass > 0.0:
         raise ValueError(f"{name} has a mass of {mass} kg; a simulated body needs mass above 0")
     moments, _ = principal(body_of(truth.theta[j])[2])
-    if moments.min() < -FLAT * max(moments.max(), 0.0) or moments.max() < 0.0:
+    if moments.min() < -1e-6 * max(moments.max(), 0.0) or moments.max() < 0.0:
         told = ", ".join(f"{moment:.3g}" for moment in moments)
         raise ValueError(
             f"{name} has principal moments of inertia of {told} kg m² about its centre; "

@@ -29,8 +29,6 @@ from sim.truth import (
 )
 
 FORMAT, VERSION = "panda-adapter/truth", 2
-TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
-BALL_RADIUS_M = 0.04  # m, the payload is a solid ball
 STAND_OFF_M = 0.05  # m, its centre is so far off the flange ...
 SIDE_STEP_M = 0.02  # m, ... and so far from the axis of joint 7
 BALL_AT = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
@@ -103,7 +101,7 @@ def payload_at_20s(
     rng: np.random.Generator, robot: str, mass: float = 1.0, t_s: float = 20.0
 ) -> Truth:
     """A ball of `mass` kg at the flange after `t_s`."""
-    ball = payload(mass, BALL_AT, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
+    ball = payload(mass, BALL_AT, 0.4 * mass * 0.04**2 * np.eye(3), t_s)
     return documented(robot).with_changes(effects=(ball,))
 
 
@@ -188,7 +186,7 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
         ValueError: unknown name, option or level, or a value out of range; with the choices.
     """
     numbers = check(name, options)
-    rng, robot = np.random.default_rng([seed, TRUTH_STREAM]), options.get("robot", ROBOTS[0])
+    rng, robot = np.random.default_rng([seed, 1 << 32]), options.get("robot", ROBOTS[0])
     truth = DRAWN_BY[name](rng, robot, **numbers)
     return Scenario(
         name,

@@ -26,12 +26,9 @@ _TORQUE_CHAIN = (
     *("x_torque_crosstalk", "x_torque_saturation", "torque_gain", "torque_offset"),
     "x_torque_deadband",
 )
-RATES_HZ = (200.0, 500.0)  # readings a second, between these
 W_NOISE, A_NOISE = 1.75e-3, 0.04  # of a reading, rad/s and m/s² rms
 W_BIAS, A_BIAS = np.radians(0.5), 0.2  # at most, rad/s and m/s²
-PLACE_M = 0.05  # from the link's frame, rms by axis
 LATE_TICKS = 6  # at most: a reading's stamp comes after what it measured
-STREAM = 1 << 33  # keeps their draw apart from that of noise and truth
 
 
 class Sensor(NamedTuple):
@@ -72,7 +69,7 @@ class Imus:
         for name in on:
             if name not in names:
                 raise ValueError(f"no link {name!r} for a sensor; {choices(name, names)}")
-        self._rng = np.random.default_rng([seed, STREAM])
+        self._rng = np.random.default_rng([seed, 1 << 33])  # apart from noise and truth
         self._n, self._k = len(names), -1
         self.sensors = [self._drawn(names.index(name), period_s) for name in on]
         self._past: deque[Array] = deque(maxlen=LATE_TICKS + 1)
@@ -82,9 +79,9 @@ class Imus:
         axes, signs = np.linalg.qr(rng.standard_normal((3, 3)))
         turn = axes * np.sign(signs.diagonal())
         turn[:, 0] *= np.linalg.det(turn)
-        every = max(round(1.0 / (rng.uniform(*RATES_HZ) * period_s)), 1)
+        every = max(round(1.0 / (rng.uniform(*(200.0, 500.0)) * period_s)), 1)
         w_bias, a_bias = W_BIAS * rng.uniform(-1, 1, 3), A_BIAS * rng.uniform(-1, 1, 3)
-        place, late = PLACE_M * rng.standard_normal(3), int(rng.integers(0, LATE_TICKS + 1))
+        place, late = 0.05 * rng.standard_normal(3), int(rng.integers(0, LATE_TICKS + 1))  # m
         return Sensor(link, turn, place, w_bias, a_bias, every, late)
 
     def read(self, motion: Array) -> LinkMotion:

@@ -29,14 +29,7 @@ from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
 from drivers.interface import Driver, JointSample
 
-GAINS_DELAY_NS = 1_000_000  # from a reading to its torque, for which the gains are made
-STIFFNESS_PER_EFFORT = 5.0  # 1/rad, of an arm that is not known by name
-DAMPING_TIME_S = 0.03  # damping over stiffness, of the same
-
-RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an arm that checks it
-START_REACH = 0.02  # rad, further from where the motion was drawn from it does not start
 FADE_S = 1.0  # from feedback alone to feed-forward
-REFRESH_TICKS = 50
 
 
 @dataclass(frozen=True)
@@ -69,8 +62,8 @@ class ControlSettings:
         n = len(limits.effort)
         known = limits.known
         effort = np.where(np.isfinite(limits.effort), limits.effort, 10.0)
-        rule = STIFFNESS_PER_EFFORT * effort if known is None else known.stiffness
-        damping_rule = DAMPING_TIME_S * rule if known is None else known.damping
+        rule = 5.0 * effort if known is None else known.stiffness  # 1/rad
+        damping_rule = 0.03 * rule if known is None else known.damping  # s
         chosen = []
         for name, own in (("stiffness", rule), ("damping", damping_rule)):
             given = getattr(self, name)
@@ -162,7 +155,7 @@ class ExcitationController:
         Raises SettingsError for an arm that says it is another than the limits are of.
         """
         need_same_robot(driver, self.limits)
-        self._D = self._full_D * min(1.0, GAINS_DELAY_NS / max(driver.delay_ns, 1))
+        self._D = self._full_D * min(1.0, 1_000_000 / max(driver.delay_ns, 1))  # ns: made for it
         self._take_on(driver.period_ns, driver.adds_gravity)
         self._carry = getattr(driver, "carry", None)  # of arms without brakes
 
@@ -246,7 +239,7 @@ class ExcitationController:
         tau = self._wanted(sample, 1e-9 * step_ns)
         if not np.isfinite(tau).all():
             raise ControlError("the model's torque is not a finite number; the arm is stopped")
-        return self._watched(tau, sample, (RATE_SHARE if now_ns else 1.0) * self._most, step_ns)
+        return self._watched(tau, sample, (0.9 if now_ns else 1.0) * self._most, step_ns)
 
     def _watched(self, tau: Array, sample: JointSample, most: Array, step_ns: int) -> Array:
         """The command (n,) N m for a wanted torque, not further than `most` from the last one."""
@@ -294,7 +287,7 @@ class ExcitationController:
             raise ControlError(f"{self.weight.refusal}; the arm was not moved")
         self._started = True
         away = np.abs(sample.q - self.reference.q)
-        if (away > START_REACH).any():
+        if (away > 0.02).any():  # rad
             j = int(np.argmax(away))
             raise ControlError(
                 f"joint {j + 1} moved by {away[j]:.3f} rad between the plan and the start; start "
@@ -308,7 +301,7 @@ class ExcitationController:
         tau: Array = self._K * error + self._D * (ref.dq - sample.dq)
         share = 0.0
         if model is not None:
-            if self._ticks % REFRESH_TICKS == 0:
+            if self._ticks % 50 == 0:
                 model.refresh()
             if model.ready:
                 self._fade_s = min(self._fade_s + dt_s, FADE_S)

@@ -39,11 +39,9 @@ from adapter.control.path_motion import (
 from adapter.control.settings import ExcitationSettings
 from adapter.model.spatial import Array
 
-MOST_HARMONICS = 16
 TABLE_PER_WAVE, GRID_PER_WAVE = 12, 32  # instants of the information and of the limits, a wave
 STEPS, FIRST_STEP = 150, 0.1  # rounds, and rad/s of the first
 MIX, EVEN = 0.3, 0.6
-ROUND = 1e-9  # of the largest; joints that are not to move leave parameters that nothing shows
 MOMENTUM, MEMORY = 0.8, 0.95
 # Of the speed that is allowed: a designed motion reaches it, and an arm lags and overshoots.
 SPEED_ROOM = 0.8
@@ -326,7 +324,7 @@ class Designer:
         if self.known is not None:
             H = H + self.known
         C, W, B = np.linalg.inv(H), self.information.in_wanted_units, inertial
-        B = B + ROUND * np.trace(B) * np.eye(len(B))
+        B = B + 1e-9 * np.trace(B) * np.eye(len(B))  # of joints that stand nothing shows some
         D = np.linalg.inv(B)
         even = EVEN if self.known is None else 0.0
         left, most, least = (float(np.trace(part)) for part in (W @ C, B, D))
@@ -339,7 +337,7 @@ class Designer:
 
 def _harmonics(settings: ExcitationSettings) -> Array:
     """(k,) rad/s: multiples of the lowest up to the highest frequency that is asked for."""
-    lowest = max(settings.low_hz, settings.high_hz / MOST_HARMONICS)
+    lowest = max(settings.low_hz, settings.high_hz / 16)  # harmonics
     count = int(settings.high_hz / lowest + 1e-9)
     return np.asarray(2.0 * np.pi * lowest * np.arange(1, max(count, 1) + 1))
 

@@ -28,14 +28,11 @@ from adapter.model.spatial import Array, matrix_from_rpy, z_to_axis
 from adapter.model.tree import BASE
 from adapter.physics.kernels import frames_of, place_frames
 
-FINEST_M = 0.005  # distances between two looks are known to so much
 TABLE, REACH = "table", "reach"
 ATTEMPTS, SAME_SIZE, SHRINK = 48, 3, 0.8  # motions drawn, of one size, and the next size
 POSES, ALWAYS = 100, 0.95  # two bodies that are near in so many of so many random poses are joined
 SAME_START = 1e-3  # rad: from so near the same motion is free, too, to a millimetre or so
-LOOKS = 100  # between two calls of `meanwhile`
 DIFFERENCE_RAD = 1e-4  # between two poses that a gradient is taken from
-BEYOND_S = 5.0  # of path, after the last stop should have ended
 
 # From limits, where the arm is, settings, attempt and size.
 Draw = Callable[[MotionLimits, Array, ExcitationSettings, int, float], PathMotion]
@@ -140,7 +137,7 @@ class ArmInCell:
                 place_frames(self._frames, motion.path(s)[0], self._R, self._o)
                 distance = self._distance(pair)
                 looks += 1
-                if looks % LOOKS == 0:
+                if looks % 100 == 0:  # a few milliseconds
                     self.meanwhile()
                 if distance < least.distance:
                     least = Clearance(distance, pair.names, s)
@@ -149,7 +146,7 @@ class ArmInCell:
                         self._pairs.insert(0, pair)  # the next motion is likely to touch there, too
                         return least
                 goal = least.distance if at_least is None else at_least
-                s += max(distance - goal, FINEST_M) / nearing
+                s += max(distance - goal, 0.005) / nearing  # m
         return least
 
     def at(self, q: Array) -> Clearance:
@@ -371,7 +368,7 @@ class FreeMotion:
                 "it by hand, or describe the cell in --config ([cell]); where their shapes only "
                 f'seem to touch, say allowed = [["{nearest.names[0]}", "{nearest.names[1]}"]] there'
             )
-        path_s = self._duration_s + settings.stop_s + BEYOND_S
+        path_s = self._duration_s + settings.stop_s + 5.0  # s of path behind the stop
         for k in range(ATTEMPTS):
             motion = self._draw(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
             nearest = self.arm.clearance(motion, path_s, margin)

@@ -33,7 +33,6 @@ BELIEF = 5.0
 NOISE_SHARE = 0.003
 # Learned beside the inertias; of friction with a memory its steps, which is where it is seen.
 EFFECTS = ("viscous_friction", "coulomb_friction", "torque_offset", "motor_inertia")
-SHOWN = 1e-9  # of a parameter's size; what torques show less of is not shown
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ class Information:
         believed = shown @ back
         std = np.linalg.norm(believed @ axes / np.sqrt(1.0 + np.maximum(gained, 0.0)), axis=1)
         before = np.linalg.norm(believed, axis=1)
-        exists = np.linalg.norm(shown, axis=1) > SHOWN * self.size
+        exists = np.linalg.norm(shown, axis=1) > 1e-9 * self.size  # less is not shown
         names, units = self._names()
         return Expected(names, units, std, share * self.size, exists & (std < 0.5 * before))
 

@@ -16,7 +16,6 @@ from drivers.interface import Driver
 # Of an arm whose documentation is silent; modest: rad/s, rad/s², rad/s³, N m/s. Of what slides the
 # same on a drum of 0.1 m: m/s, m/s², m/s³.
 UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK = 1.0, 5.0, 1000.0
-UNKNOWN_TORQUE_RATE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class MotionLimits:
             UNKNOWN_ACCELERATION * modest if known is None else known.acceleration,
             UNKNOWN_JERK * modest if known is None else known.jerk,
             np.where(np.isfinite(limits.effort), limits.effort, np.inf),
-            np.full(n, UNKNOWN_TORQUE_RATE) if known is None else known.torque_rate,
+            np.full(n, 1000.0) if known is None else known.torque_rate,
             known,
             model.tree.joint_names,
             model.tree.slides,

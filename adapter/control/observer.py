@@ -39,10 +39,8 @@ SIGMAS, HOLD_S = 8.0, 0.1
 SLOW_S, NOISE_S = 0.3, 5.0  # what is slower is no noise; over which noise is measured
 AGO_NS, LONG_AGO_S = 15_000_000, 0.1  # readings before, between which a momentum's rate is taken
 WARM_UP_S = 1.0  # of noise before the first contact is believed
-SPIKE_S = 0.01  # times the effort limit: the momentum that one reading may be off by
 CLIP = 3.0  # standard deviations that count at most where noise is measured
 TURN_DQ, TURN_SHARE = 0.03, 0.3  # rad/s; share of friction that is unknown at a slower joint
-PROBE_DQ = 0.1  # rad/s, at which friction is asked for
 # Of an arm that nobody learned: shares of the effort limit and of the torque that carries it.
 UNLEARNED_EFFORT, UNLEARNED_WEIGHT = 0.02, 0.05
 NOT_KNOWN = np.array([100.0, 100.0, 100.0, 30.0, 30.0, 30.0])  # std of a wrench, N, N m
@@ -331,7 +329,7 @@ class ContactObserver:
         self._past = np.zeros(2, dtype=np.int64), np.zeros((2, 2, n))
         self._stamps, self._signals = np.zeros(1, dtype=np.int64), np.zeros((1, 3, n))
         self._q, self._dq, self._tau = self._signals[0]
-        table[Of.SPIKE] = SPIKE_S * effort
+        table[Of.SPIKE] = 0.01 * effort  # s: the momentum that one reading may be off by
         effort = np.where(np.isfinite(effort), effort, 0.0)
         table[Of.ERROR], table[Of.WEIGHT] = UNLEARNED_EFFORT * effort, UNLEARNED_WEIGHT
         self._take_over()
@@ -406,7 +404,7 @@ class ContactObserver:
         """What stands still of the model in use."""
         model = self._model
         self._bodies = model.frames, model.theta, model.gravity
-        self._table[Of.TURNING] = TURN_SHARE * np.abs(model.friction(PROBE_DQ))
+        self._table[Of.TURNING] = TURN_SHARE * np.abs(model.friction(0.1))  # rad/s
         self._table[Of.INERTIA] = model.motor_inertia()
 
     def step(self, sample: JointSample) -> Array:

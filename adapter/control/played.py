@@ -30,8 +30,6 @@ from adapter.model.spatial import Array
 APPROACH_S = 4.0
 # Largest slope, bend and jerk of the quintic step over one second.
 STEP = 1.875, 5.78, 60.0
-LOOKS = 4  # between two points
-LEAST_PACE = 0.25  # of the share of the limits; one that has to be slower is another motion
 
 
 class PlayedMotion(PathMotion):
@@ -136,7 +134,7 @@ class Player:
             return _kept(limits, settings, _with_ramps((*self._reach[:2], *rates), settings))
 
         pace = float(largest(np.ones(self.q.shape[1]), kept).min())
-        if pace < LEAST_PACE * settings.share:
+        if pace < 0.25 * settings.share:  # slower, it is another motion
             raise SettingsError(
                 f"{self.name}: keeps the limits at {pace:.1%} of its speed alone; does it rest "
                 "where it begins and ends, are its times in s and its positions in rad?"
@@ -156,7 +154,7 @@ class Player:
     @cached_property
     def _reach(self) -> tuple[Array, ...]:
         """Lowest, highest q, highest |q'|, |q''|, |q'''| at the points and between, (n,) each."""
-        between = np.arange(LOOKS) / LOOKS
+        between = np.arange(4) / 4  # looks between two points
         looks = np.append(self.t[:-1, None] + np.diff(self.t)[:, None] * between, self.t[-1])
         q, *rates = (self._spline(looks, k) for k in range(4))
         return q.min(axis=0), q.max(axis=0), *(np.abs(x).max(axis=0) for x in rates)

@@ -16,11 +16,6 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from drivers.interface import JointSample
 
-RESYNC_AFTER = 5  # stamps in a row that lie before the newest one: the clock was set back
-CLEAR = 0.35  # of a period: nearer than this to a tick, an instant belongs to it
-AWAY = 20  # periods beyond what the stamps say: the loop was away, or a simulated arm stood still
-FOLLOW = 16  # the ticks follow the instants by one part in so many
-
 
 class SampleClock:
     """Turns stamps into steps of time that never go back and never leap.
@@ -74,7 +69,7 @@ class SampleClock:
         goes_on = self._behind and stamp_ns > self._behind_ns
         self._behind = self._behind + 1 if goes_on else 1
         self._behind_ns = stamp_ns
-        if self._behind < RESYNC_AFTER:
+        if self._behind < 5:  # in a row: the clock was set back
             self.fresh = False
             return 0
         self._newest_ns, self._behind = stamp_ns, 0
@@ -86,17 +81,17 @@ class SampleClock:
             return 0
         self.clock_step_ns, self._last_ns = max(now_ns - self._last_ns, 0), now_ns
         period, since_ns = self._period_ns, max(now_ns - self._tick_ns, 0)
-        if self.fresh and not self.leapt and since_ns - step_ns > AWAY * period:
+        if self.fresh and not self.leapt and since_ns - step_ns > 20 * period:  # nobody was there
             self._tick_ns = now_ns
             return step_ns
         ticks = round(since_ns / period)
         off_ns = since_ns - ticks * period
-        if abs(off_ns) > CLEAR * period:
+        if abs(off_ns) > 0.35 * period:  # nearer, it belongs to the tick
             stamped = round(step_ns / period)
             if abs(stamped * period - since_ns) < period:
                 ticks, off_ns = stamped, since_ns - stamped * period
         if ticks:
-            self._tick_ns += ticks * period + off_ns // FOLLOW
+            self._tick_ns += ticks * period + off_ns // 16
         return ticks * period
 
 
@@ -106,10 +101,7 @@ JUMP = 0.005  # rad, beyond what the measured speeds say: noise, steps of the en
 DRIFT = 0.25  # of the documented speed, by which the measured one may be wrong or late
 FASTER = 1.5  # of the documented speed is more than a joint does
 HARDER = 100.0  # rad/s² is more than an arm does, five times what a Panda may
-STUCK_EFFORT = 0.1  # of the effort limit that the spring winds up on a reading that stands still
-STUCK_WAY = 0.02  # rad that the measured speed makes meanwhile
 BLIND_NS = 20_000_000  # without a usable reading for so long, the controller gives up
-LONGEST_STEP_NS = 20_000_000  # a longer step of the stamps alone is a clock that was set
 _SINCE = f"for {1e-9 * BLIND_NS:g} s; the arm is stopped"
 
 
@@ -162,7 +154,7 @@ def judge_reading(q, dq, q_ref, between_s, bounds, last):
         if q[j] != last_q[j]:
             continue
         wound = abs(q_ref[j] - reference[j]) > wind[j]
-        if wound or abs(way[j] + dq[j] * least_s) > STUCK_WAY:
+        if wound or abs(way[j] + dq[j] * least_s) > 0.02:  # rad
             return ReadingVerdict.STUCK.value, j
     for j in range(n):
         if q[j] != last_q[j]:
@@ -201,7 +193,7 @@ class ReadingGate:
 
     def __init__(self, velocity: Array, effort: Array, stiffness: Array, period_ns: int) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            wind = STUCK_EFFORT * np.asarray(effort) / stiffness
+            wind = 0.1 * np.asarray(effort) / stiffness  # of the limit, in the spring
         wind = np.where(np.isfinite(wind), wind, np.inf)
         self._bounds = np.array([velocity, wind], dtype=np.float64)
         self._last, self._joint = np.full((4, len(velocity)), np.nan), 0
@@ -209,7 +201,7 @@ class ReadingGate:
         still = np.zeros(len(velocity))  # compiled now, not in the first tick
         judge_reading(still, still, still, (0.0, 0.0), self._bounds, self._last.copy())
         self._period_ns = period_ns
-        self._clock = SampleClock(period_ns, LONGEST_STEP_NS)
+        self._clock = SampleClock(period_ns, 20_000_000)  # ns; longer, a clock was set
         self._started = self._leapt = False
         self.unusable = 0
         self._blind_ns = self._handled_ns = self._stamped_ns = 0

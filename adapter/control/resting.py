@@ -23,9 +23,6 @@ from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 
 BAND_SHARE, LEAST_BAND = 0.1, 0.5  # of the effort limit, and N m: friction, offsets, model error
-LOAD_SHARE = 1 / 3  # of the mass of the moving links, that may hang on a hand unsaid
-LARGEST_SHARE = 0.01  # of the largest beside the sum beyond the band
-LOAD_REACH_M = 0.35  # of its centre from the frame of the last link, along each axis
 
 
 def check_resting_torque(model: SelfModel, q: Array, tau: Array) -> None:
@@ -65,7 +62,7 @@ class CarriedWeight:
         effort = np.where(np.isfinite(model.limits.effort), model.limits.effort, 0.0)
         self._model, self._plain = model, ModelFeedforward.of(model)
         self._band = np.maximum(BAND_SHARE * effort, LEAST_BAND)
-        self._heaviest = LOAD_SHARE * float(model.theta[:, 0].sum())
+        self._heaviest = 1 / 3 * float(model.theta[:, 0].sum())  # that a hand may carry unsaid
         self._loaded, self._trusted = self._plain, trusted
         self._more = np.zeros(len(effort))
         self.refusal: str | None = None
@@ -125,10 +122,10 @@ def _best_load(wanted: Array, loads: Array, band: Array, heaviest: float) -> Arr
         if k % 4:  # a first moment: at most the reach times its mass, to both sides
             for sign in (1.0, -1.0):
                 row = np.zeros(count + n + 1)
-                row[k], row[k - k % 4] = sign, -LOAD_REACH_M
+                row[k], row[k - k % 4] = sign, -0.35  # m
                 rows.append(row[None])
                 ends.append(np.zeros(1))
-    goal = np.r_[np.zeros(count), np.ones(n), LARGEST_SHARE]
+    goal = np.r_[np.zeros(count), np.ones(n), 0.01]  # of the largest beside the sum
     bounds: list[tuple[float | None, float | None]] = [
         (0.0, heaviest) if k % 4 == 0 else (None, None) for k in range(count)
     ]

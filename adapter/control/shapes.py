@@ -36,8 +36,6 @@ from drivers.files.bounded import read_bytes
 
 FORMATS = ".stl, .obj"
 MOST_TRIANGLES = 200_000  # some 30 MB with the search tree over them
-INTEGER_DIGITS = 12  # of a corner's number; what is longer is none
-FURTHEST_M = 100.0  # from the mesh's origin; what is larger was drawn in millimetres
 HEADER_BYTES, RECORD = 80, np.dtype([("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("more", "<u2")])
 PACKAGE, FILE = "package://", "file://"
 LEVELS = 8  # folders above a URDF that a package is looked for in
@@ -139,7 +137,7 @@ def _check(corners: Array, triangles: NDArray[np.int64]) -> None:
         raise ValueError("a triangle has a corner that the file does not have")
     if not np.isfinite(corners).all():
         raise ValueError("a corner is not a finite number")
-    if (far := float(np.abs(corners).max())) > FURTHEST_M:
+    if (far := float(np.abs(corners).max())) > 100.0:  # m
         raise ValueError(f"is {far:g} m large; a scale of 0.001 makes metres of millimetres")
 
 
@@ -184,7 +182,7 @@ def _obj(content: bytes) -> tuple[Array, NDArray[np.int64]]:
 def _corner(part: bytes, count: int) -> int:
     """The corner's number from 0; negative ones count from the last one before."""
     try:
-        number = int(part.split(b"/")[0][:INTEGER_DIGITS])
+        number = int(part.split(b"/")[0][:12])  # longer, it is none
     except ValueError:
         raise ValueError(f"a face has the corner {part[:20]!r}, which is no number") from None
     return number - 1 if number > 0 else count + number
@@ -208,8 +206,6 @@ def _few(count: int) -> None:
 
 
 THINNEST_M, THICKEST_M = 0.03, 0.15  # radius that an inertia may say
-HAND_RADIUS_M = 0.1  # of a hand on an arm that is known by name: Franka's is 0.2 m wide
-ENOUGH_M = 0.02  # beyond the known shapes, a frame on the hand says that something is there
 
 
 @dataclass(frozen=True)
@@ -264,9 +260,9 @@ def _on_the_hand(model: SelfModel, known: list[Body]) -> Iterator[Body]:
     for link in leaves(model):
         reach = max(np.abs(c.ends).max() + c.radius for c in known if c.link == link)
         for frame in model.frames:
-            far = np.linalg.norm(frame.position) > reach + ENOUGH_M
+            far = np.linalg.norm(frame.position) > reach + 0.02  # m
             if frame.parent == model.tree.link_names[link] and far:
-                yield Body(link, np.array([np.zeros(3), frame.position]), HAND_RADIUS_M)
+                yield Body(link, np.array([np.zeros(3), frame.position]), 0.1)  # m
 
 
 def _of_collisions(model: SelfModel) -> tuple[list[Body], set[int]]:

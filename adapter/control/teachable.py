@@ -19,7 +19,6 @@ CUTOFF_HZ, OF_RATE = 10.0, 0.2  # of the smoothing: what arms move at, and of th
 SHORT_S = 10.0  # of motion; periodic motions that show an arm take 10 s and more
 RESTS = 0.05  # rad/s, a joint that is never faster rests
 REVERSALS = 2  # of a joint, from which on friction and offset come apart
-WANTED = 0.05  # of each parameter's usual size
 SHORTEST = 30  # samples of a stretch that is used
 
 
@@ -68,7 +67,7 @@ def teachable(log: Log, model: SelfModel) -> Teachable:
     missing = _missing(model.tree.joint_names, dq, np.sqrt((moved**2).mean(axis=0)), std)
     if moving_s < SHORT_S:
         missing = [f"too short: {moving_s:.1f} s of motion; {SHORT_S:g} s and more tell", *missing]
-    expected = told.expected(information, WANTED)
+    expected = told.expected(information, 0.05)  # of each usual size
     return Teachable(rank, told.basis.shape[1], expected, std, tuple(missing))
 
 

@@ -22,8 +22,6 @@ from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, regres
 from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader, SnapshotWriter
 from drivers.interface import JointSample
 
-REFRESH_TICKS = 500  # an estimate taken over costs some 0.2 ms
-
 
 class EstimateFollower:
     """Follows the estimate that a learner publishes; attach it when the snapshot exists."""
@@ -102,7 +100,7 @@ class FollowingObserver(EstimateFollower):
     def step(self, sample: JointSample) -> Array:
         """External torque (n,) N m with this sample."""
         self._ticks += 1
-        new = self.new_estimate() if self._ticks % REFRESH_TICKS == 0 else None
+        new = self.new_estimate() if self._ticks % 500 == 0 else None  # some 0.2 ms
         if new is not None:
             values = new.lam, new.theta, new.effects, new.effect_shapes, new.torque_std
             self.observer.adopt(*values)
@@ -116,9 +114,6 @@ class FollowingObserver(EstimateFollower):
 
 
 LOAD_SHARE, LOAD_OFF_M = 0.25, 0.15  # of the arm's own mass, at the last link; off its origin
-FRICTION_SHARE = 0.1  # of the effort limit
-SIGMAS = 3.0
-RETURN_SHARE = 0.8  # of the bound, inside of which a later estimate is believed again
 FADE_CALLS = 500  # one in each tick
 
 
@@ -136,7 +131,7 @@ class FeedforwardBound:
         effort = np.where(np.isfinite(documented.limits.effort), documented.limits.effort, 0.0)
         mass = LOAD_SHARE * float(documented.theta[:, 0].sum())
         reach = mass * LOAD_OFF_M * float(np.linalg.norm(documented.gravity))
-        self._friction = FRICTION_SHARE * effort + reach
+        self._friction = 0.1 * effort + reach  # of the effort limit
         load = np.zeros((n, 10))
         load[-1, 0] = mass
         self._load = ModelFeedforward(tree, documented.gravity)
@@ -151,7 +146,7 @@ class FeedforwardBound:
         allowed = np.abs(self._load(q, dq, ddq)) + self._friction
         regressors(self._frames, JointMotion(q[None], dq[None], ddq[None]), self._base, self._Y)
         variance = self._Y[0] ** 2 @ np.nan_to_num(theta_std.reshape(-1)) ** 2
-        bound: Array = allowed + np.minimum(SIGMAS * np.sqrt(variance), allowed)
+        bound: Array = allowed + np.minimum(3.0 * np.sqrt(variance), allowed)
         return bound
 
 
@@ -212,7 +207,7 @@ class LearnedFeedforward(EstimateFollower, Feedforward):
                 if self._bound is not None and self._trust == 0.0:
                     q, dq, ddq = self._asked
                     apart = np.abs(self._model(q, dq, ddq) - self._bound.model(q, dq, ddq))
-                    self._believed = bool((apart <= RETURN_SHARE * self._most).all())
+                    self._believed = bool((apart <= 0.8 * self._most).all())  # of the bound
                 self._std = snapshot.theta_std
         if self.ready and self._bound is not None:
             q, dq, ddq = self._asked

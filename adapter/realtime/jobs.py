@@ -36,8 +36,6 @@ from drivers.files.messages import Message
 # How often news are published, and how often a recorder tells an estimate, the links' places and
 # what the loop's timing was meanwhile.
 NEWS_S, ESTIMATE_S, FRAMES_S, TIMING_S = 0.25, 0.1, 1.0 / 30.0, 1.0
-PUSHES = 100  # read from the loop's board before the posture at their instant is known
-HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
 
 
 @dataclass(frozen=True)
@@ -274,7 +272,7 @@ class RecorderTask:
             if now >= flush_at or 2 * ring.kept > ring.rows:
                 writer.flush()
                 ring.give_back()
-                flush_at = now + HAND_OVER_S
+                flush_at = now + 0.8 * FLUSH_S  # the system has them by then
         return written
 
 
@@ -301,7 +299,7 @@ class Beside:
         self._messages = RunMessages(names, job.arm)
         self._stamp_ns = self._frames_at_ns = 0
         self._look_at = self._timing_at = 0.0
-        self._pushes: deque[ExternalTorque] = deque(maxlen=PUSHES)
+        self._pushes: deque[ExternalTorque] = deque(maxlen=100)
 
     def sample(self, stamp_ns: int, q: Array) -> None:
         """A sample was written."""

@@ -24,9 +24,7 @@ from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, Intake, JointSample
 from drivers.process import StopSignals
 
-LOOK_EVERY = 256  # ticks between two looks at the workers
 WALL_SHARE, WALL_EXTRA_S = 1.1, 2.0  # a run whose stamps stand still ends by the clock on the wall
-WARM_UP_TICKS = 500  # of made-up motion, for the compiler
 WARM_UP_REACH, WARM_UP_RATE = 0.02, 10.0  # rad, rad/s
 HUNG_UP = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
@@ -220,7 +218,7 @@ def _prepare(
 
     sample = session.get_ready(prepare)
     shown = copy.deepcopy(front_end)  # some motion around this sample, so that all is compiled
-    for k in range(1, WARM_UP_TICKS):
+    for k in range(1, 500):
         angle = WARM_UP_RATE * 1e-9 * driver.period_ns * k
         q = sample.q + WARM_UP_REACH * np.sin(angle)
         dq = np.full(q.shape, WARM_UP_REACH * WARM_UP_RATE * np.cos(angle))
@@ -268,7 +266,7 @@ class _Loop:
             ticks += 1
             if stop.count:
                 session.begin_stop(Ended.INTERRUPTED)
-            if ticks % LOOK_EVERY == 0:
+            if ticks % 256 == 0:
                 self._supervisor.look_after()
                 if self._supervisor.loop_board is not None:
                     missed = self._clock.missed, self._clock.missed_own
@@ -283,15 +281,11 @@ class _Loop:
     def result(self, grants: list[str], collected: Any) -> LiveResult:
         """What became of the run."""
         session, supervisor = self._session, self._supervisor
+        counted = "passed_on", "skipped", "unlearned", "restarts", "recorded", "unrecorded"
         return LiveResult(
             samples=session.samples,
             set_aside=session.set_aside,
-            passed_on=supervisor.passed_on,
-            skipped=supervisor.skipped,
-            unlearned=supervisor.unlearned,
-            restarts=supervisor.restarts,
-            recorded=supervisor.recorded,
-            unrecorded=supervisor.unrecorded,
+            **{key: getattr(supervisor, key) for key in counted},
             ended=session.ended,
             fault=session.fault,
             timing=self._timing.report(self._clock.missed, self._clock.missed_own),

@@ -7,21 +7,15 @@ deadlines, t0 + k * period: no drift, and a missed one is missed, not postponed.
 from __future__ import annotations
 
 import ctypes
-import gc
 import os
 import resource
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
-from drivers.process import sleep_until
+from drivers.process import Answer, pin, quiet_collector, request_fifo, sleep_until
 
 MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
-PRIORITY = 70  # of SCHED_FIFO: above the kernel's interrupt threads (50), below its watchdogs (99)
-
-
-# One clear sentence on a request, and what takes back what was granted; None where nothing was.
-Answer = tuple[str, Callable[[], None] | None]
 
 
 def split_cores(allowed: Sequence[int] | None = None) -> tuple[set[int], set[int]]:
@@ -45,7 +39,7 @@ class RealTime:
         self.grants: list[str] = []
 
     def __enter__(self) -> RealTime:
-        for answer in (quiet_collector(), lock_memory(), pin({self._core}), request_fifo(PRIORITY)):
+        for answer in (quiet_collector(), lock_memory(), pin({self._core}), request_fifo(70)):
             line, undo = answer
             self.grants.append(line)
             if undo is not None:
@@ -54,19 +48,6 @@ class RealTime:
 
     def __exit__(self, *error: object) -> None:
         self._undo.close()
-
-
-def request_fifo(priority: int) -> Answer:
-    """SCHED_FIFO for the calling thread; its children start ordinary."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(0, policy, os.sched_param(priority))
-    except (OSError, ValueError) as error:
-        why = "needs root, CAP_SYS_NICE or an rtprio limit (ulimit -r)"
-        return f"priority: SCHED_FIFO {priority} refused ({error}); {why}", None
-    line = f"priority: SCHED_FIFO {priority} granted"
-    return line, lambda: os.sched_setscheduler(0, *before)
 
 
 def lock_memory() -> Answer:
@@ -86,35 +67,6 @@ def lock_memory() -> Answer:
         libc.munlockall()
 
     return f"memory: locked, {what}", undo
-
-
-def pin(cores: set[int]) -> Answer:
-    """Keep the calling thread on these cores."""
-    before = os.sched_getaffinity(0)
-    names = ", ".join(map(str, sorted(cores)))
-    try:
-        os.sched_setaffinity(0, cores)
-    except (OSError, ValueError) as error:
-        have = ", ".join(map(str, sorted(before)))
-        return f"core: {names} refused ({error}); have: {have}", None
-    shared = " (the only one: the workers share it)" if before <= cores else ""
-    line = f"core: the loop runs on core {names}{shared}"
-    return line, lambda: os.sched_setaffinity(0, before)
-
-
-def quiet_collector() -> Answer:
-    """Collect once, then leave everything that lives alone and collect no more."""
-    enabled = gc.isenabled()
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-
-    def undo() -> None:
-        gc.unfreeze()
-        if enabled:
-            gc.enable()
-
-    return "collector: frozen and off", undo
 
 
 SPIN_NS = 120_000  # wait actively for so long: waking up takes the system some 50 to 100 µs

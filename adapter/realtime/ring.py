@@ -233,10 +233,6 @@ class RawLayout:
         )
         self.motion = slice(2 + 5 * n, self.size)
 
-    def new(self) -> Array:
-        """An empty record."""
-        return np.zeros(self.size)
-
     def fill(
         self,
         record: Array,

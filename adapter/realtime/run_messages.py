@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,7 +64,6 @@ TOPICS = {
 }
 DOCUMENTED, LEARNED = "documented", "learned"
 OK, WARN = 0, 1  # levels of a DiagnosticStatus
-WORLD = "world"
 
 
 class ArmFrames:
@@ -90,7 +90,7 @@ class ArmFrames:
         turns = dict(zip(links, (np.eye(3), *self._axes), strict=True))
         self.moving = [(names[i + 1], names[j + 1]) for j, i in enumerate(tree.parent)]
         riding = [(f"{prefix}/{f.parent}", f"{prefix}/{f.name}") for f in model.frames]
-        self.fixed = [(WORLD, names[0]), *riding]
+        self.fixed = [("world", names[0]), *riding]
         rotations = np.array([np.eye(3), *(turns[f.parent] @ f.rotation for f in model.frames)])
         places = np.array([np.zeros(3), *(turns[f.parent] @ f.position for f in model.frames)])
         self.fixed_rows = _rows(places, quaternion_from_matrix(rotations))
@@ -153,7 +153,12 @@ class ShownArm:
     def of(cls, documented: SelfModel) -> ShownArm:
         """From the documented model; runs compiled code, some ms."""
         seen = frame_observability(documented.tree, documented.lam, documented.gravity)
-        return cls(documented, description_of(documented), seen.freedom)
+        if documented.source is not None and documented.source.text is not None:
+            return cls(documented, documented.source.text, seen.freedom)
+        more, text = Additions(documented.tree.n, documented.tree.floating, ()), ""
+        with suppress(ModelError):  # bodies that a URDF cannot hold
+            text = filled("urdf", documented, more)
+        return cls(documented, text, seen.freedom)
 
 
 def nearest_frames(freedom: Freedom, lam: Array, documented: Array) -> tuple[Array, Array, Array]:
@@ -172,17 +177,6 @@ def nearest_frames(freedom: Freedom, lam: Array, documented: Array) -> tuple[Arr
     told = matrix_from_zxz(documented[:, :3]), documented[:, 3:]
     R, p = freedom.nearest(matrix_from_zxz(lam[:, :3]), lam[:, 3:], *told)
     return R, p, np.hstack([log_rotation(R @ np.swapaxes(told[0], 1, 2)), p - told[1]])
-
-
-def description_of(model: SelfModel) -> str:
-    """URDF text of a robot: its own file, or one written from the model; empty where it has
-    bodies that a URDF cannot hold."""
-    if model.source is not None and model.source.text is not None:
-        return model.source.text
-    try:
-        return filled("urdf", model, Additions(model.tree.n, model.tree.floating, ()))
-    except ModelError:
-        return ""
 
 
 def estimate_names(

@@ -18,10 +18,7 @@ from adapter.realtime.following import FollowingObserver
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
-STOP_LIMIT_S = 5.0  # a safe stop that takes longer is left to the driver
-LEAP_NS = 1_000_000_000  # a longer step of the stamps is a clock that was set, not time gone by
 CATCH_UP_READS, FRESH_READS = 5000, 3  # at most, and at least: a driver may look one tick back
-START_READS = 200  # samples among which there has to be one that a motion can start from
 
 
 class Ended(StrEnum):
@@ -75,7 +72,7 @@ class Session:
         self.fault: str | None = None
         self.began_ns = self.had_ns = self.stepped_ns = 0
         self.stopped = False
-        self._elapsed_ns, self._clock = 0, SampleClock(driver.period_ns, LEAP_NS)
+        self._elapsed_ns, self._clock = 0, SampleClock(driver.period_ns, 1_000_000_000)
         self._stopping_at_s: float | None = None
         self._ready_sample: JointSample | None = None
         if controller is not None:
@@ -93,7 +90,7 @@ class Session:
             DriverError: as the driver says.
         """
         driver = self._driver
-        for left in reversed(range(START_READS)):
+        for left in reversed(range(200)):
             sample = driver.read()
             try:
                 prepare(sample)
@@ -164,7 +161,7 @@ class Session:
             return True
         if self._controller is None or self._controller.at_rest:
             return False
-        return self.elapsed_s < self._stopping_at_s + STOP_LIMIT_S
+        return self.elapsed_s < self._stopping_at_s + 5.0  # s; then the driver stops it
 
     def _move(self, sample: JointSample) -> tuple[Array | None, str | None]:
         if self._controller is None:

@@ -24,7 +24,6 @@ from adapter.physics.kernels import jit
 SHM_FOLDER = Path("/dev/shm")
 SEQUENCE = 0  # word of a slot that counts publications
 WORDS = 8  # of a slot
-KEEP_FREE = 4 << 20  # bytes of shared memory left to others
 _TRACKED_ALWAYS = sys.version_info < (3, 13)
 _attaching = threading.Lock()
 
@@ -56,7 +55,7 @@ def free_bytes() -> int | None:
         state = os.statvfs(SHM_FOLDER)
     except OSError:
         return None
-    return max(state.f_bavail * state.f_frsize - KEEP_FREE, 0)
+    return max(state.f_bavail * state.f_frsize - (4 << 20), 0)  # left to others
 
 
 class SharedBlock:

@@ -76,7 +76,7 @@ class Supervisor:
         self._say, self._jobs = say, jobs
         self._names = tuple(driver.joint_names), tuple(driver.link_names)
         self.raw = RawLayout(len(self._names[0]), len(self._names[1]))
-        self._record = self.raw.new()
+        self._record = np.zeros(self.raw.size)
         self._state_size, self._period_ns, self._options = state_size, driver.period_ns, options
         self._cores = split_cores()[1]
         self._starter: ThreadPoolExecutor | None = None

@@ -285,7 +285,11 @@ class RestartableWorker:
         """Wait for the end of the work, whoever does it; the worker that did, or None."""
         while self.held:
             if self._next is not None:
-                self._await(self._next, hurry)
+                if wait([self._next], POLL_S).done:
+                    self._take(self._next)
+                elif hurry():
+                    self._next = None
+                    self._tell(f"nobody waited for a new {self.name}; {self._lost}")
                 continue
             worker = self.worker
             assert worker is not None
@@ -314,14 +318,6 @@ class RestartableWorker:
             self._started.append(self._next)
         else:
             self._tell(f"{trouble}; {self._lost}")
-
-    def _await(self, future: Future[Worker], hurry: Callable[[], bool]) -> None:
-        while not wait([future], POLL_S).done:
-            if hurry():
-                self._next = None
-                self._tell(f"nobody waited for a new {self.name}; {self._lost}")
-                return
-        self._take(future)
 
     def _take(self, future: Future[Worker]) -> None:
         self._next, error = None, future.exception()

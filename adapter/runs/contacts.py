@@ -23,12 +23,8 @@ from adapter.physics.kernels import Frames, JointMotion, base_at_rest, regressor
 
 ADOPT_EVERY = 100  # samples
 
-LEAST = 10  # samples that a name takes
-ALIKE = 3.0  # samples that are one by their noise
 PUSH = np.array([20.0, 20.0, 20.0, 5.0, 5.0, 5.0])  # std of N and N m
 LOAD = np.array([2.0, 0.2, 0.2, 0.2])  # std of kg and kg m
-FRICTION_SHARE = 0.05  # std of a joint's friction, of its effort limit
-CRUDE = 0.2  # of the torques, by which a way may be off: a load's inertia, a push that swells
 
 
 class Kind(StrEnum):
@@ -49,15 +45,15 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
         frames: of the arm; gravity: (3,) m/s²; effort: (n,) limits, N m.
     """
     seen = contact.seen[8:]  # at the beginning the observer still follows
-    if len(seen) < LEAST:
+    if len(seen) < 10:  # samples that a name takes
         return Kind.OPEN
     since_s, q, dq, torque, std = np.array(seen).transpose(1, 0, 2).copy()
     times = since_s[:, 0]
     rates = np.polynomial.polynomial.polyder(np.polynomial.polynomial.polyfit(times, dq, 3))
     ddq = np.ascontiguousarray(np.polynomial.polynomial.polyval(times, rates).T)
     joints = JointMotion(q, dq, ddq)
-    crude = CRUDE * np.sqrt((torque**2).mean(axis=0))
-    weight = 1.0 / np.sqrt(ALIKE * (std**2 + crude**2))
+    crude = 0.2 * np.sqrt((torque**2).mean(axis=0))  # a way may be off by
+    weight = 1.0 / np.sqrt(3.0 * (std**2 + crude**2))  # samples alike by noise
     ways = _ways(joints, frames, gravity, np.where(np.isfinite(effort), effort, 10.0))
     names, evidence = [], []
     for name, columns in ways:
@@ -81,7 +77,7 @@ def _ways(
     wrench_torques(frames, q, np.diag(PUSH), push)
     regressors(frames, joints, base_at_rest(gravity)[None], Y)
     load = -Y[..., 10 * (n - 1) : 10 * (n - 1) + len(LOAD)] * LOAD
-    size = FRICTION_SHARE * effort
+    size = 0.05 * effort  # std, N m
     ways = [(Kind.PUSH, push), (Kind.LOAD, load)]
     for j in range(n):
         rubs = np.zeros((*q.shape, 1))

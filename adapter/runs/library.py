@@ -42,7 +42,6 @@ from drivers.files.mcap import Log
 from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion
 
-HELD_OUT_SHARE = 0.25  # of a recording, at its end
 EXPORTED: dict[str, Callable[..., RobotText]] = {  # by suffix, what writes a model
     ".urdf": robot_urdf,
     ".xml": robot_mjcf,
@@ -217,7 +216,7 @@ def learn(
     """
     arm, own = _fitting(model, _log(log))
     end_s = last_s(own) if len(own) else 0.0
-    split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
+    split_s = 0.75 * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
         raise SettingsError(f"validation from {split_s} s is outside 0 to {end_s:.1f} s")
     own, arm, said = check_torque(own, arm)

@@ -33,13 +33,11 @@ from drivers.files.mcap import Log
 
 KEPT_LEARNER, KEPT_MONITOR = "learner.npz", "monitor.pickle"
 MOST_FINDINGS = 40  # the newest, that other processes are told of
-STD_EVERY = 50  # publications; the covariance behind the standard deviations takes a millisecond
 
 # Of motion: the first verdict and the last. In between there is one each time the motion is twice
 # as long: joints that stood at first are judged then, and a load that was picked up in the first
 # seconds (its torques may look like another arm's) weighs less.
 FIRST_S, LAST_S = 5.0, 40.0
-MOST_ROWS = 20_000  # kept; of more every second one
 
 
 class LiveScreen:
@@ -57,7 +55,7 @@ class LiveScreen:
         self._arm, self._say, self._told = documented, say, {"told": Told(trusted=trusted)}
         self._verdict = TorqueVerdict(judged=documented.tree.floating)
         self._at = StateLayout(documented.tree.n)
-        self._states = Trace(self._at.tau.stop, stride=1, capacity=MOST_ROWS)
+        self._states = Trace(self._at.tau.stop, stride=1, capacity=20_000)
         self._moved_s, self._last_ns, self._due_s = 0.0, 0, FIRST_S
 
     def __call__(self, state: Array) -> TorqueVerdict:
@@ -200,7 +198,7 @@ class Publisher:
 
     def __call__(self, learner: OnlineLearner) -> Snapshot:
         """The estimate as it stands."""
-        if self._std is None or self._calls % STD_EVERY == 0:
+        if self._std is None or self._calls % 50 == 0:  # it takes a millisecond
             self._std = self._deviations(learner)
         self._calls += 1
         good = learner.verdict.good

@@ -98,10 +98,7 @@ class AnsweredCommands:
         count.sent += 1
 
 
-WATCHDOG_S = 0.5  # without a command for so long a motor lets go: a last resort, own choice
 FIRST_ROUNDS, ROUND_TIMEOUT_S = 2, 0.1  # replies that the first sample lies between
-CARRIED_SHARE = 0.02  # of each tick's torque in the mean that carries a braked arm: 50 ms
-DELAY_PERIODS = 5  # halves of one: a sample is one old, a command on the bus most of one, held one
 # The torque command of each code, with nothing else: q, dq, kp, kd zero. The same for all types.
 TORQUE_FRAMES = [
     mit_command(Scales(1.0, 1.0, 1.0))[:6] + code.to_bytes(2, "big") for code in range(CODES + 1)
@@ -149,7 +146,7 @@ class DamiaoArm:
         self.joint_names = tuple(joint_names or (f"joint{j + 1}" for j in range(n)))
         self.link_names = tuple(f"link{j + 1}" for j in range(n))
         self.period_ns = 1_000_000_000 // settings.rate_hz
-        self.delay_ns = DELAY_PERIODS * self.period_ns // 2
+        self.delay_ns = 5 * self.period_ns // 2  # one old, most of one on the bus, held one
         self.can_move = allow_motion
         self.intake = Intake()
         self.arrived_ns = 0
@@ -240,7 +237,7 @@ class DamiaoArm:
             self._guardian.memory.put(q, dq, self._carried)
             self._guardian.memory.hold(q)
             self._relieved = self._guardian.relieve_former()
-            talk.write(codec.TIMEOUT, round(WATCHDOG_S / TIMEOUT_UNIT_S))
+            talk.write(codec.TIMEOUT, round(0.5 / TIMEOUT_UNIT_S))  # s, then a motor lets go
 
     def _hand_over(self, hold: Sequence[float]) -> None:
         """From driving to holding at these angles."""
@@ -298,10 +295,13 @@ class DamiaoArm:
             self._speed.add(stamp_ns, q, dq)
             if self._driving:
                 # what the arm must be carried with, here and with the guardian
-                self._carried = self._told or [
-                    old + CARRIED_SHARE * (new - old)
-                    for old, new in zip(self._carried, values[2 * n :], strict=True)
-                ]
+                self._carried = (
+                    self._told
+                    or [  # a mean over 50 ms
+                        old + 0.02 * (new - old)
+                        for old, new in zip(self._carried, values[2 * n :], strict=True)
+                    ]
+                )
                 if self._guardian is not None:
                     parts = values[:n], values[n : 2 * n], self._carried, values[2 * n :]
                     self._guardian.memory.put(*parts)
@@ -425,9 +425,7 @@ def torque_frames(tau: Array, tau_max: Sequence[float]) -> tuple[list[bytes], bo
     return frames, cut
 
 
-WINDOW_NS = 50_000_000
 LEAST_WINDOWS, MOST_WINDOWS = 10, 60  # 0.5 s to 3 s of windows
-FIT = 0.995  # correlation of a slope that counts: a stuck encoder is something else
 # rad: changes of q are known to a step's 1/sqrt(6), a step being at most 25 rad / 65535
 Q_NOISE = 25.0 / 65535 / 6.0**0.5
 
@@ -458,7 +456,7 @@ class SpeedCheck:
             self._sum += dq
             self._count += 1
             span_ns = stamp_ns - self._start_ns
-            if span_ns < WINDOW_NS:
+            if span_ns < 50_000_000:  # ns
                 return
             mean = (self._sum - 0.5 * (self._start_dq + dq)) / (self._count - 1)
             self._windows[:, self._filled] = q - self._start_q, mean * (1e-9 * span_ns)
@@ -489,7 +487,7 @@ class SpeedCheck:
             (off > 0.1)  # of the slope
             & (off > 6.0 * deviation)  # standard deviations that a wrong slope must lie off
             & (deviation < 0.02)  # standard deviation of a slope that counts
-            & (fit > FIT**2)
+            & (fit > 0.995**2)  # correlation; a stuck encoder is something else
         )
         for j in np.flatnonzero(wrong)[:1]:
             raise DriverError(

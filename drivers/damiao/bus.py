@@ -16,7 +16,6 @@ from drivers.interface import DriverError
 
 BATCH_LIMIT = 512  # frames in one go; a babbling bus must not stop the loop
 DATAGRAM_BYTES, ANCILLARY_BYTES = 4096, 128
-BUFFER_BYTES = 1 << 20
 TIMESPEC = struct.Struct("@ll")  # of SO_TIMESTAMPNS
 UNREADABLE = -1  # in place of an id: bytes that are no CAN frame
 ERROR_FRAME, NOT_A_REPLY = 1, 2
@@ -65,7 +64,7 @@ class MulticastWire(Wire):
         super().__init__(bus)
         self._socket = socket.socket(fileno=os.dup(bus.fileno()))
         with contextlib.suppress(OSError):  # the kernel's usual 200 kB last for 256 frames
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
 
     def waiting(self) -> list[Frame]:
         """See `Wire`."""

@@ -27,8 +27,6 @@ MIT_MODE = 1  # of CTRL_MODE
 TIMEOUT_UNIT_S = 50e-6  # as two of three sources say; the third says milliseconds
 INTEGER_REGISTERS = frozenset((*range(7, 11), *range(13, 17), 35, 36))
 
-BELOW_ZERO_FROM = 216  # a temperature byte from here on means -40..-1 deg C, as one source has it
-
 
 class WireError(ValueError):
     """Bytes that are not what they should be, or values that cannot be put into bytes."""
@@ -139,7 +137,7 @@ def state(limits: Scales, data: bytes | bytearray) -> State:
 
 def temperature(code: int) -> int:
     """deg C of a temperature byte."""
-    return code - 256 if code >= BELOW_ZERO_FROM else code
+    return code - 256 if code >= 216 else code  # -40..-1 deg C, as one source has it
 
 
 def refresh(motor_id: int) -> bytes:

@@ -47,11 +47,8 @@ from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
 from drivers.process import Block
 
-MOST_JOINTS = 15
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
-GO_ON_BEATS = 2  # commands seen after driving was forbidden; one may have been under way
-GONE_S = 10.0
 READY = "ready"
 
 
@@ -83,7 +80,7 @@ class GuardianMemory(Block):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("mode", "beat_ns", "taken", "_pushed")),
         *((name, ctypes.c_double) for name in ("_torque", "_limit")),
-        *((name, ctypes.c_double * MOST_JOINTS) for name in ("held", "q", "dq", "carried", "tau")),
+        *((name, ctypes.c_double * 15) for name in ("held", "q", "dq", "carried", "tau")),
     )
 
     @property
@@ -178,7 +175,7 @@ class Guardian:
                 return
             self._listen()
             self._send(self._braker.commands(HOLD_S, self._q, self._dq))
-            if time.monotonic() - self._heard_s > GONE_S:
+            if time.monotonic() - self._heard_s > 10.0:
                 self._say("no motor answers any more; nothing is left to hold")
                 return
             time.sleep(HOLD_S)
@@ -198,7 +195,7 @@ class Guardian:
             self._gone_on = 0
         elif beat_ns != before_ns and memory.forbidden is not None:
             self._gone_on += 1
-            if self._gone_on >= GO_ON_BEATS and os.getppid() == self._parent:
+            if self._gone_on >= 2 and os.getppid() == self._parent:
                 self._say(f"process {self._parent} goes on driving; it is ended")
                 os.kill(self._parent, signal.SIGKILL)
         elif beat_ns != before_ns:

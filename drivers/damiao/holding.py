@@ -19,9 +19,6 @@ from drivers.interface import DriverError
 
 # Own choice. N m/rad per N m of TMAX: full torque at 0.25 rad; DM8009 216, DM4340 112, DM4310 40.
 STIFFNESS_PER_TORQUE = 4.0
-DAMPING_TIME_S = 0.05  # kd over kp, up to the protocol's 5 N m s/rad
-SLOW = 0.1  # rad/s: below this on every joint the arm counts as standing
-DAMP_AT_MOST_S = 0.5  # a joint that still drifts then is held nevertheless
 FADE_S = 0.2
 SINK_S = 3.0  # over which a held arm is let down
 STEP_S = 0.002
@@ -43,7 +40,7 @@ STANDING = 0.05
 def gains(limits: Scales) -> tuple[float, float]:
     """(kp, kd) that hold a joint, N m/rad and N m s/rad."""
     kp = min(STIFFNESS_PER_TORQUE * limits.tau_max, KP_MAX)
-    return kp, min(DAMPING_TIME_S * kp, KD_MAX)
+    return kp, min(0.05 * kp, KD_MAX)  # kd over kp, s
 
 
 class Braker:
@@ -89,8 +86,8 @@ class Braker:
                         self.hold[j] -= math.copysign(min(abs(away) - most, step), away)
         else:
             self._braking_s += dt_s
-            slow = all(abs(speed) < SLOW for speed in dq if speed == speed)
-            if (slow and self._braking_s > 2 * dt_s) or self._braking_s >= DAMP_AT_MOST_S:
+            slow = all(abs(speed) < 0.1 for speed in dq if speed == speed)  # rad/s
+            if (slow and self._braking_s > 2 * dt_s) or self._braking_s >= 0.5:  # s
                 self.hold, self.holding_s = list(q), 0.0
         share = min(self.holding_s / FADE_S, 1.0) if self.hold is not None else 0.0
         return [self._command(j, share, q[j]) for j in range(len(self._limits))]

@@ -17,9 +17,6 @@ BITS = {
     False: ((122.945, 0.0), (114.94, 0.0), (135, 0)),
     True: ((30.435, 106.86), (30.0, 99.32), (33, 114)),
 }
-TYPICAL_SHARE = 0.85  # of a tick that typical frames may fill; motors and hosts need gaps
-WORST_SHARE = 1.0
-ROUND_RATES_HZ = (1000, 800, 500, 400, 250, 200, 100, 50)
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ def budget(
     if _fits(found, rate_hz):
         return found
     ways = []
-    for rate in ROUND_RATES_HZ:
+    for rate in (1000, 800, 500, 400, 250, 200, 100, 50):
         slower = frame_times(joints, rate, fd, bitrate, data_bitrate)
         if rate < rate_hz and _fits(slower, rate):
             ways.append(f"at most {rate} Hz (?rate={rate})")
@@ -89,7 +86,7 @@ def frame_times(
 
 
 def _fits(found: BusTime, rate_hz: int) -> bool:
-    return found.load <= TYPICAL_SHARE and found.worst_us * rate_hz / 1e6 <= WORST_SHARE
+    return found.load <= 0.85 and found.worst_us * rate_hz / 1e6 <= 1.0  # motors need gaps
 
 
 VIRTUAL, MULTICAST = "virtual", "udp_multicast"
@@ -102,7 +99,6 @@ RANGES = {
     "first_id": (1, 15),
     "reply_offset": (1, 0x7E0),
 }
-OPTIONS = ("interface", "fd", *RANGES, "guardian")
 
 
 @dataclass(frozen=True)
@@ -152,7 +148,7 @@ class BusSettings:
     @classmethod
     def of(cls, address: str, joint_names: Sequence[str] | None = None) -> BusSettings:
         """Read `can://CHANNEL?interface=...`. Raises DriverError, naming the choices."""
-        parts = Address.of(address, OPTIONS)
+        parts = Address.of(address, ("interface", "fd", *RANGES, "guardian"))
         if parts.scheme != "can":
             raise DriverError(f"'{address}' is no CAN arm; write can://CHANNEL?interface=...")
         options = dict(parts.options)

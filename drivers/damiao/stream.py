@@ -26,9 +26,7 @@ from drivers.damiao.timing import NOTHING, ArrivalClock, Reading, at_instant
 from drivers.interface import DriverError, Intake
 
 SEND_FAILURES = 20  # ticks in a row in which a frame could not be sent
-REACH_TICKS = 5  # a joint's motion is predicted over so many
 SILENT_NS = 100_000_000
-SILENT_TICKS = 10
 OWN_ID, STRANGER = -1, -2  # in place of a joint's index
 SETTLE_EVERY, SETTLE_TIMES = 16, 8  # ticks; looks after which a missing reply counts as lost
 
@@ -83,7 +81,7 @@ class ReplyIntake:
         self._wire, self._settings, self.intake = wire, settings, intake
         self._echoes, self._driven = echoes, driven
         self._reply_ns = round(1e3 * settings.budget.reply_us)
-        self._reach_ns = REACH_TICKS * 1_000_000_000 // settings.rate_hz
+        self._reach_ns = 5 * 1_000_000_000 // settings.rate_hz  # of prediction
         self._index = dict.fromkeys([*settings.ids, codec.SERVICE_ID], OWN_ID)
         self._index.update({can_id: j for j, can_id in enumerate(settings.reply_ids)})
         self._scales = [
@@ -194,7 +192,7 @@ class ReplyIntake:
             silent = []
             for j in missing:
                 self._missed[j] += 1
-                if self._missed[j] >= SILENT_TICKS and stamp_ns - self.latest[j][0] >= SILENT_NS:
+                if self._missed[j] >= 10 and stamp_ns - self.latest[j][0] >= SILENT_NS:
                     silent.append(f"{j + 1} (id 0x{self._settings.ids[j]:02x})")
             if silent:
                 raise DriverError(

@@ -20,8 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-GIVE_UP_AFTER = 50  # impossible wall-clock stamps in a row: the interface has its own clock
-DRIFT_PER_NS = 1e-4  # own clocks: how fast a least offset is forgotten, 100 ppm
 SLACK_NS = 2_000  # stamps are floats, 0.24 us apart, and the two clocks are read one by one
 # stamp_ns, q, dq, tau
 Reading = tuple[int, float, float, float]
@@ -57,7 +55,7 @@ class ArrivalClock:
             self._impossible = 0
         self._replaced_before = self.replaced
         if self._least_ns is not None:
-            self._least_ns += DRIFT_PER_NS * (now_ns - self.now_ns)
+            self._least_ns += 1e-4 * (now_ns - self.now_ns)  # forgotten by 100 ppm
         self.first_ns, self._looked_ns, self.now_ns = self._looked_ns - SLACK_NS, looked_ns, now_ns
         self._offset_before_ns, self.offset_ns = self.offset_ns, now_ns - wall_ns
 
@@ -75,7 +73,7 @@ class ArrivalClock:
             if first <= at <= now:
                 return at
             self._impossible += 1
-            self.own_clock = self._impossible > GIVE_UP_AFTER
+            self.own_clock = self._impossible > 50  # in a row
             self.replaced += 1
             return now
         offset = float(now - stamp_ns)

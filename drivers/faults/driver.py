@@ -24,8 +24,6 @@ MOST_BITS = 3  # flipped at a time
 SIGNALS = ("q", "dq", "tau")
 # A spike of factor 1 is up to this far off: rad, rad/s, N m; at least a fifth of it.
 SPIKE_SIZE = {"q": 0.5, "dq": 2.0, "tau": 30.0}
-LEAST_SPIKE = 0.2
-LONGEST_STAMP_BIT = 62  # the sign of a stamp stays
 
 
 def flip_bits(values: Array, at: int, rng: np.random.Generator) -> Array:
@@ -57,7 +55,7 @@ def corrupt(sample: JointSample, rng: np.random.Generator) -> JointSample:
 def corrupt_stamp(sample: JointSample, rng: np.random.Generator) -> JointSample:
     """Flip bits of the stamp."""
     stamp_ns = sample.stamp_ns
-    bits = rng.choice(LONGEST_STAMP_BIT, size=rng.integers(1, MOST_BITS + 1), replace=False)
+    bits = rng.choice(62, size=rng.integers(1, MOST_BITS + 1), replace=False)
     for bit in bits:
         stamp_ns ^= 1 << int(bit)
     return replace(sample, stamp_ns=stamp_ns)
@@ -81,7 +79,7 @@ def blank(sample: JointSample, rng: np.random.Generator) -> JointSample:
 def spike(sample: JointSample, rng: np.random.Generator, factor: float) -> JointSample:
     """One reading of one joint is off by up to `factor` times the usual size of a spike."""
     name = SIGNALS[rng.integers(len(SIGNALS))]
-    size = rng.uniform(LEAST_SPIKE, 1.0) * rng.choice([-1.0, 1.0])
+    size = rng.uniform(0.2, 1.0) * rng.choice([-1.0, 1.0])
     joint = int(rng.integers(len(sample.q)))
     value = getattr(sample, name)[joint] + factor * SPIKE_SIZE[name] * size
     return with_reading(sample, name, joint, value)

@@ -19,8 +19,6 @@ from drivers.fci.tables import told
 from drivers.fci.torque_control import TorqueControl
 from drivers.interface import Array, DriverError, Intake, JointSample, NotReady, checked_torques
 
-SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
-RECOVERED_S = 3.0  # from the answer to a recovery until the modes show it
 _ROBOTS = {tables.PANDA: "panda", tables.FR3: "fr3"}
 _NAMES = {
     version: tuple(f"{robot}_joint{i}" for i in range(1, JOINTS + 1))
@@ -196,7 +194,7 @@ class FciArm:
         if state.status.robot_mode == tables.ROBOT_REFLEX and self._target.recover:
             assert self._connection is not None
             recover(self._connection)
-            deadline = time.monotonic() + RECOVERED_S
+            deadline = time.monotonic() + 3.0  # s
             while state.status.robot_mode in (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY):
                 if time.monotonic() > deadline:
                     raise NotReady(
@@ -233,7 +231,7 @@ class FciArm:
 
 def _next_of(stream: StateStream) -> State:
     """The next state. Raises DriverError where none comes in time."""
-    state = stream.next(SILENCE_S)
+    state = stream.next(1.0)  # s, as Franka's own client
     if state is None:
         raise DriverError(stream.silence())
     return state

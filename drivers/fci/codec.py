@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from drivers.fci.tables import ERROR_COUNT
 from drivers.interface import Array, DriverError
 
 JOINTS = 7
-MAX_ID: Final = 1 << 40  # ticks of 1 ms; no robot runs for 34 years
 _ID = struct.Struct("<Q")
 
 
@@ -48,7 +47,6 @@ _PLACES = {
 }
 _COMMAND_TORQUES = 314
 HEADER = struct.Struct("<III")  # command, command id, size with header
-LONGEST = 1 << 24  # bytes of a message; a robot model has about 10 kB
 _CONNECT = struct.Struct("<HH")
 _CONNECT_REPLY = struct.Struct("<BH")
 # Translation, rotation and elbow deviation that every client sends; without use here.
@@ -124,7 +122,7 @@ class StateDecoder:
                 f"a state of {length} bytes; protocol {self.version} has {self.size} bytes"
             )
         message_id = id_at(data, start)
-        if message_id > MAX_ID:
+        if message_id > 1 << 40:  # ms: no robot runs for 34 years
             raise WireError(f"a state with the absurd message id {message_id}")
         status_bytes = bytes(data[start + self._at.modes : start + self._at.rate])
         if status_bytes != self._last_bytes or self._last is None:
@@ -236,7 +234,7 @@ class ReplyParser:
         replies = []
         while len(self._waiting) >= HEADER.size:
             _, command_id, size = HEADER.unpack_from(self._waiting)
-            if not HEADER.size <= size <= LONGEST:
+            if not HEADER.size <= size <= 1 << 24:  # bytes; a robot model has about 10 kB
                 raise WireError(f"an answer whose header says {size} bytes")
             if len(self._waiting) < size:
                 break

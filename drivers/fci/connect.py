@@ -18,10 +18,7 @@ from drivers.interface import DriverError, NotReady
 
 REPLY_LIMIT_S = 5.0
 RECOVERY_LIMIT_S = 10.0
-FIRST_STATE_S = 1.0  # for the length of the first state, which tells the version as well
 AUTO = "auto"
-LOOPBACK = ("127.0.0.1", "localhost")  # a simulated arm is looked for
-OPTIONS = ("protocol", "recover", "collision", "load")
 VERSIONS = {AUTO: None, "5": tables.PANDA, "10": tables.FR3}
 
 
@@ -43,7 +40,7 @@ class Channel:
         except ConnectionRefusedError as error:
             here = "start `adapter sim fci` and wait until it says that it is ready"
             robot = "switch the robot on, unlock its brakes and activate FCI in Desk"
-            advice = here if host in LOOPBACK else robot
+            advice = here if host in ("127.0.0.1", "localhost") else robot
             raise DriverError(f"no FCI at {where}: {advice}") from error
         except TimeoutError as error:
             raise DriverError(
@@ -137,7 +134,7 @@ class Target(NamedTuple):
 
 def parse(address: str) -> Target:
     """What `fci://HOST[:PORT][?protocol=5|10|auto&...]` asks for. Raises DriverError."""
-    parts = Address.of(address, OPTIONS)
+    parts = Address.of(address, ("protocol", "recover", "collision", "load"))
     protocol = parts.options.get("protocol", AUTO)
     if protocol not in VERSIONS:
         raise DriverError(f"'{address}': no protocol {protocol}; have: {', '.join(VERSIONS)}")
@@ -207,7 +204,7 @@ def _try(target: Target, version: int) -> tuple[Connection | None, int]:
                 "defined: check its system version"
             )
         if status == 0 and target.version is None:
-            length = connection.reader.next_length(FIRST_STATE_S)
+            length = connection.reader.next_length(1.0)  # s
             server = tables.FR3 if length == StateDecoder(tables.FR3).size else server
     except BaseException:
         connection.close()

@@ -35,7 +35,6 @@ WORD = struct.Struct("@Q")
 # by the kernel since the socket was opened, drops here since the last record, arrival
 # (CLOCK_MONOTONIC, ns).
 RECORD = struct.Struct("@H2x4sIIIxxxxq")
-PRIORITY = 75  # SCHED_FIFO; above the loop, which waits for what we deliver
 SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40  # <asm-generic/socket.h>
 TIME_OUT_S = 0.25  # between two looks whether the driver still lives
 _TIMESPEC = struct.Struct("@qq")
@@ -50,14 +49,6 @@ def slot_size(state_size: int) -> int:
 def ring_size(state_size: int) -> int:
     """Bytes of the shared memory."""
     return FIRST_SLOT + SLOTS * slot_size(state_size)
-
-
-def prepare(udp: socket.socket) -> None:
-    """Options of the socket that the reader relies on; the driver sets them once."""
-    udp.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    udp.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-    time_out = struct.pack("@qq", 0, int(TIME_OUT_S * 1e6))
-    udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, time_out)
 
 
 def arrival_ns(wall_ns: int) -> int:
@@ -160,7 +151,7 @@ def main(arguments: list[str]) -> None:
     with contextlib.suppress(OSError):  # a core taken away meanwhile: any other will do
         os.sched_setaffinity(0, map(int, arguments[7].split(",")))
     with contextlib.suppress(OSError):  # not permitted: an ordinary priority has to do
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(75))  # above the loop
     shared = mmap.mmap(memory, ring_size(state_size))
     if before >= 0 and not gone(before, parent):
         return

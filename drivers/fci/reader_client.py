@@ -6,6 +6,7 @@ import mmap
 import os
 import select
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -21,8 +22,6 @@ from drivers.interface import DriverError
 # thread is told to give it up. Python's default of 5 ms is five ticks of the robot.
 RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
 _SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
-SPARE_AFTER = 100  # records after a takeover; to start a process takes some of the robot's ticks
-START_LIMIT_S = 10.0  # a reader needs about 0.05 s
 RESTARTS, RESTARTS_WITHIN_S = 5, 10.0
 
 
@@ -100,7 +99,10 @@ def open_udp(host: str) -> socket.socket:
             udp.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
         except PermissionError:
             udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        reader.prepare(udp)
+        udp.setsockopt(socket.SOL_SOCKET, reader.SO_TIMESTAMPNS, 1)
+        udp.setsockopt(socket.SOL_SOCKET, reader.SO_RXQ_OVFL, 1)
+        time_out = struct.pack("@qq", 0, int(reader.TIME_OUT_S * 1e6))
+        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, time_out)
     except OSError as error:
         udp.close()
         raise DriverError(f"no UDP socket for the robot's states at {host}: {error}") from error
@@ -155,7 +157,7 @@ class ReaderClient:
         first = self._spawn(-1)
         self._work_with(first)
         self._spare = self._spawn(first.alive)
-        deadline = time.monotonic() + START_LIMIT_S
+        deadline = time.monotonic() + 10.0  # it needs about 0.05 s
         while not WORD.unpack_from(self._map, READY)[0]:
             if self._wait(deadline - time.monotonic()) is not True:
                 raise DriverError("the process that reads the robot's states does not start")
@@ -249,7 +251,7 @@ class ReaderClient:
         """Take records from this one from now on, and a little later have a spare for it."""
         self._reader, self._spare = reader_, None
         self._poll.register(reader_.alive, 0)  # hanging up is always told
-        self._spare_at = self._taken + SPARE_AFTER
+        self._spare_at = self._taken + 100  # a start takes some of the robot's ticks
 
     def _restart(self) -> None:
         """The spare reads from the same socket, which kept the datagrams meanwhile."""

@@ -22,7 +22,6 @@ TORQUES: Final = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
 FORCES: Final = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
 # What Franka's examples call the default (setDefaultBehavior): while it accelerates, else.
 DEFAULT_PHASES: Final = (20.0, 10.0)
-BALL_RADIUS_M: Final = 0.04  # of a load of which mass and centre are known
 KEEP: Final = "keep"
 LEAST, MOST = 0.1, 5.0  # of `?collision`
 HEAVIEST_KG: Final = 10.0  # no robot here carries half of it
@@ -61,7 +60,7 @@ def parse(address: str, options: Mapping[str, str]) -> tuple[float | None, Load 
         com = com or [0.0, 0.0, 0.0]
         if len(com) != 3 or not 0.0 <= mass <= HEAVIEST_KG or not all(abs(x) <= 1.0 for x in com):
             raise ValueError
-        ball = 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3)
+        ball = 0.4 * mass * 0.04**2 * np.eye(3)  # m
         return collision, Load(mass, np.array(com), ball.ravel())
     except ValueError as error:
         raise DriverError(

@@ -21,7 +21,6 @@ STALE_NS = 500_000_000  # a waiting state older than this tells of an absent loo
 # motion does not survive 20 ticks without commands; late datagrams may come many in a row.
 NEWER_COUNT_AFTER, OLDER_COUNT_AFTER = 10, 100
 SLACK_TICKS = 20  # that a count may be ahead of the time that has passed
-USABLE_WITHIN_NS = 1_000_000_000  # a stream of nothing but refused datagrams is no stream
 
 
 class Refusal(StrEnum):
@@ -54,6 +53,7 @@ class StateIntake:
         intake: the account.
         kernel_drops: datagrams that the kernel dropped because its buffer was full; part of
             `intake.lost`.
+        refused_since_ns: when the first of those came that are all refused; 0 after a good one.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class StateIntake:
         self._arrived_ns = 0
         self._unread = 0  # datagrams since the last good one of which only the number is known
         self._other_id, self._others = -1, 0
-        self._refused_since_ns = 0
+        self.refused_since_ns = 0
 
     def arrived(self, record: Record) -> None:
         """Count a record, before anything else is done with it."""
@@ -81,12 +81,7 @@ class StateIntake:
         if reason == Refusal.MALFORMED:
             self._unread += 1
         self._count(reason, 1)
-        self._refused_since_ns = self._refused_since_ns or record.arrived_ns
-
-    def useless(self, record: Record) -> bool:
-        """Nothing but refused datagrams for a second, this one included."""
-        since_ns = self._refused_since_ns
-        return bool(since_ns) and record.arrived_ns - since_ns > USABLE_WITHIN_NS
+        self.refused_since_ns = self.refused_since_ns or record.arrived_ns
 
     def judge(self, message_id: int, record: Record, now_ns: int) -> Refusal | None:
         """Why a state of this id is refused; None takes it."""
@@ -107,7 +102,7 @@ class StateIntake:
             else:
                 return Refusal.OUT_OF_ORDER if ahead < 0 else Refusal.MALFORMED
         self._id, self._arrived_ns = message_id, record.arrived_ns
-        self._unread = self._others = self._refused_since_ns = 0
+        self._unread = self._others = self.refused_since_ns = 0
         return Refusal.STALE if now_ns - record.arrived_ns > STALE_NS else None
 
     def _is_new_count(self, message_id: int) -> bool:
@@ -177,7 +172,8 @@ class StateStream:
                 self._start = record.start
                 return state
             account.refuse(reason, record)
-            if account.useless(record):
+            since_ns = account.refused_since_ns
+            if since_ns and record.arrived_ns - since_ns > 1_000_000_000:
                 raise DriverError(
                     f"for 1 s the robot has sent nothing of use, the last was {reason}"
                     f"{self._last_refused}: check ?protocol and the network, connect again"

@@ -22,14 +22,10 @@ from drivers.interface import Array, CommandCount, DriverError, NotReady
 
 START_LIMIT_S = 2.0  # from Move to the running modes
 END_LIMIT_S = 0.1  # for the second answer once the modes are left; TCP may hold it back 40 ms
-RATE_WINDOW = 100  # commands that the robot's success rate is taken over
-LOOK_EVERY = 100  # states between two looks at the TCP channel
-ENDED_AFTER = 2  # states in a row that say so; a single one may be a damaged datagram
 BRAKE_S, EASE_S, FINISH_S, STOP_MOVE_S = 0.3, 0.2, 0.3, 0.5
 QUIET_S = 0.1  # without a state for so long, a motion is stopped over TCP
 # N m s/rad, damping of a Panda's joints that an ordinary 1 kHz loop keeps stable.
 BRAKE_DAMPING = np.array([15.0, 25.0, 8.0, 15.0, 1.2, 1.6, 0.3])
-AT_REST = 0.02  # rad/s
 
 Send = Callable[[bytearray], None]
 NextState = Callable[[float], State | None]  # waits at most so many seconds
@@ -90,7 +86,7 @@ class TorqueControl:
             self._phase, self._accepted = _STARTING, False
             self._deadline = time.monotonic() + START_LIMIT_S
             self.limiter.reset()
-            self._answered, self._sent_id, self._rates = -SLOTS, -1, -RATE_WINDOW
+            self._answered, self._sent_id, self._rates = -SLOTS, -1, -100
         elif self._phase == _RUNNING:
             self._drive(tau.tolist(), accepted, message_id)
 
@@ -136,9 +132,9 @@ class TorqueControl:
                 elif state.status is not self._status:
                     self._odd = self._odd + 1 if self._ticks == self._odd_tick + 1 else 1
                     self._odd_tick = self._ticks
-                    if self._odd >= ENDED_AFTER:
+                    if self._odd >= 2:  # one may be a damaged datagram
                         self._ended(state)
-                elif self._ticks % LOOK_EVERY == 0:
+                elif self._ticks % 100 == 0:
                     self._channel.poll()
                     if self._channel.closed:
                         self._fail("the robot cut the connection; it brakes by itself: see Desk")
@@ -228,7 +224,7 @@ class TorqueControl:
             self.look(state)
             if self._phase != _RUNNING:
                 return
-            moving = np.isfinite(state.dq).all() and np.abs(state.dq).max() > AT_REST
+            moving = np.isfinite(state.dq).all() and np.abs(state.dq).max() > 0.02  # rad/s
             brakes = moving and time.monotonic() - begin < BRAKE_S
             tau = -BRAKE_DAMPING * state.dq if brakes else np.zeros_like(state.dq)
             self._drive(tau.tolist(), state.tau_J_d, state.message_id)
@@ -283,7 +279,6 @@ TORQUE_STEP = 0.99
 
 SETTLE_TICKS = 3  # an accepted torque that stays for so long is not on its way to ours
 OWN_COMMANDS = 32  # an accepted torque is one of so many that were sent last
-SAME = 1e-3  # N m; rounding of an f32 and some
 STRANGE_TICKS = 3  # a torque that is none of ours is believed when it comes so often in a row
 
 
@@ -354,7 +349,7 @@ class TorqueLimiter:
     def _believed(self, accepted: list[float]) -> list[float] | None:
         """The torque that the robot drives with: one of ours. None for any other: bits can flip."""
         for known in (self._accepted, *reversed(self._sent)):
-            if all(abs(own - other) <= SAME for own, other in zip(accepted, known, strict=True)):
+            if all(abs(own - other) <= 1e-3 for own, other in zip(accepted, known, strict=True)):
                 self._strange = 0
                 return known
         self._strange += 1

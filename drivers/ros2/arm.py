@@ -29,7 +29,6 @@ from drivers.ros2.memory import SLOTS, Asked, Doing, Memory, Refusal
 from drivers.ros2.settings import EXAMPLE, parse
 
 READY_S, STOP_S, END_S = 60.0, 3.0, 2.0
-POLL_S = 0.002
 NOTES = {
     Refusal.UNREADABLE: "joint states come that cannot be read; is it another type that is sent?",
     Refusal.OTHER_JOINTS: "joint states of other joints come on the same topic; they are left out",
@@ -166,7 +165,7 @@ class Ros2Arm:
         ):
             if bridge.memory.words.doing not in (*BRAKES, Doing.DRIVING):
                 break  # no command of ours was sent yet
-            time.sleep(POLL_S)
+            time.sleep(0.002)  # s
         self._driving, self._fault = False, ""
 
     def close(self) -> None:

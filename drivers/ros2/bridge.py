@@ -37,14 +37,11 @@ DESCRIPTION = "/robot_description"
 # For the first states, s; where discovery shows somebody who sends them
 FIRST_S, SLOW_S = 4.0, 15.0
 SEEN_S, MEASURED = 1.0, 20  # at least, before others are judged; messages that tell the rate
-BLIND_S = 0.005  # without a state, of an arm that is braked: its speed is not known any more
 SILENCE_S = 0.05  # without a command, of an arm that is driven
 HELD_S = 10.0  # that an arm is held for which nobody asks any more
 FASTEST, JUMP_RAD = 30.0, 0.05  # rad/s, rad: no joint is further on than that
 JUMPS = 20  # in a row are no disturbance: the arm is somewhere else
-RATE_SHARE = 0.1
 LEAST_HZ = 800  # below, what brakes the arm (`holding`) does not hold it against its weight
-PRIORITY = 75  # SCHED_FIFO; above the loop, which waits for what is delivered here
 BRAKES = (Doing.BRAKING, Doing.HOLDING)
 
 
@@ -175,7 +172,7 @@ class Bridge:
         stamps = [np.frombuffer(data, "<i4", 2, 4).tolist() for data in first]
         steps = np.diff([sec + 1e-9 * nanosec for sec, nanosec in stamps])
         hz = 1.0 / max(float(np.median(steps)), 1e-9)
-        if abs(hz / where.hz - 1.0) > RATE_SHARE:
+        if abs(hz / where.hz - 1.0) > 0.1:
             raise DriverError(
                 f"{where.states} comes at {hz:.0f} Hz, not {where.hz:.0f}; say hz={hz:.0f} in the "
                 "address"
@@ -343,7 +340,7 @@ class Bridge:
                 self._take_over(f"{topic} has been silent for {1e3 * unheard_s:.0f} ms")
             elif silent_s > SILENCE_S:
                 self._take_over(f"no command came for {1e3 * silent_s:.0f} ms")
-        if memory.words.doing in BRAKES and now - self._heard > BLIND_S:
+        if memory.words.doing in BRAKES and now - self._heard > 0.005:  # s, blind
             self._send(self._braker.blind())
         if self._commands is not None and now > self._look_at:
             self._look_at = now + 0.25  # between two looks at who else commands
@@ -389,7 +386,7 @@ def main() -> None:
     """Run by the driver."""
     start = Start(*json.loads(sys.argv[1]))
     with contextlib.suppress(OSError):  # the threads of DDS begin later and inherit it
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(75))  # above the loop
     try:
         bridge = Bridge(start)
         bridge.prepare()

@@ -22,10 +22,7 @@ MOST_ACCELERATION = 2500.0  # rad/s² that the largest torque gives to the light
 DAMPED_SHARE = 0.3  # of the speed, in one period
 SPRING_RATE, INTEGRAL_RATE = 10.0, 1.5  # 1/s: stiffness over damping, integral over stiffness
 BRAKE_S = 0.25  # from the speed it has to a stand
-SOFT_SHARE = 0.15  # of the largest torque, that the spring of an arm at rest may have
 SLOW, SLOW_S = 0.05, 0.1  # rad/s, s: then it stands
-SETTLE_AT_MOST_S = 2.0  # an arm that still moves then is held nevertheless
-CARRY_S = 0.02  # speeds and torques measured are averaged over so long
 
 
 class Braker:
@@ -57,7 +54,7 @@ class Braker:
 
     def listen(self, dq: Array, tau: Array) -> None:
         """Speeds and torques (n,) measured; while somebody else drives, too."""
-        now, share = np.stack([dq, tau]), min(self._period_s / CARRY_S, 1.0)
+        now, share = np.stack([dq, tau]), min(self._period_s / 0.02, 1.0)
         self._mean = now if self._mean is None else self._mean + share * (now - self._mean)
 
     def blind(self) -> Array:
@@ -77,7 +74,7 @@ class Braker:
         speed = max(1.0 - self._braked_s / BRAKE_S, 0.0) * self._speed
         self._goal = self._goal + speed * self._period_s
         self._look_whether_it_stands(q, dq)
-        away, most = self._goal - q, (SOFT_SHARE if self.standing else 1.0) * self.effort
+        away, most = self._goal - q, (0.15 if self.standing else 1.0) * self.effort
         self._integral = np.clip(
             self._integral + INTEGRAL_RATE * self._kp * away * self._period_s, -most, most
         )
@@ -90,7 +87,7 @@ class Braker:
         self._slow_s = self._slow_s + self._period_s if slow else 0.0
         if self.standing or self._braked_s < BRAKE_S:
             return
-        if self._slow_s >= SLOW_S or self._braked_s >= SETTLE_AT_MOST_S:
+        if self._slow_s >= SLOW_S or self._braked_s >= 2.0:  # s
             self.standing = True
             if slow and self._mean is not None:
                 self._goal, self._integral = q, np.zeros(len(q))

@@ -26,7 +26,6 @@ LOCAL = """<CycloneDDS><Domain Id="any"><General><Interfaces>
 </Discovery></Domain></CycloneDDS>"""  # this machine only, without multicast
 MISSING = "DDS needs a package that is not installed: pip install 'panda-adapter[ros]'"
 MOST_TAKEN, MOST_ENDS = 32, 4096
-ALIVE = 16  # `cyclonedds.core.InstanceState.Alive`
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Network:
         found = []
         for end in self._seen[which].read(MOST_ENDS):
             name, schema = ros_topic(end.topic_name), ros_schema(end.type_name)
-            if name and end.sample_info.instance_state == ALIVE:
+            if name and end.sample_info.instance_state == 16:
                 found.append(Found(name, schema, str(end.key)))
         return found
 

@@ -17,8 +17,6 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
 from sim.damiao.codec import REFRESH, SERVICE_ID, data_frame
 
-DATAGRAM_BYTES = 4096
-BUFFER_BYTES = 1 << 20  # 0.1 s of frames at 1 kHz; the kernel may grant less
 INTERFACES = ("udp_multicast", "socketcan")
 MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
 MULTICAST_PORT = 43113  # python-can's default port
@@ -34,7 +32,7 @@ class BoardsMulticastBus(UdpMulticastBus):
         self._own: deque[bytes] = deque(maxlen=256)  # that may be under way
         self._socket = socket.socket(fileno=os.dup(self.fileno()))
         with contextlib.suppress(OSError):
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame to the group. Raises can.CanOperationError."""
@@ -54,7 +52,7 @@ class BoardsMulticastBus(UdpMulticastBus):
         end = None if timeout is None else time.monotonic() + timeout
         while True:
             try:
-                data = self._socket.recv(DATAGRAM_BYTES, socket.MSG_DONTWAIT)
+                data = self._socket.recv(4096, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 left_s = None if end is None else end - time.monotonic()
                 if left_s is not None and left_s <= 0.0:

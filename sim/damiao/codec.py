@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from typing import NamedTuple
 
 import can
 
 FRAME_BYTES = 8
 SERVICE_ID = 0x7FF  # register access, refresh and save; the motor's id is in the data
-KP_MAX = 500.0  # N m/rad
-KD_MAX = 5.0  # N m s/rad
 
 # Byte 7 after seven bytes FF.
 CLEAR_ERROR, ENABLE, DISABLE, SET_ZERO = 0xFB, 0xFC, 0xFD, 0xFE
@@ -61,8 +58,8 @@ def decode_command(data: bytes, scale: FullScale) -> MitCommand:
     return MitCommand(
         from_code(word >> 48, -pmax, pmax, 16),
         from_code(word >> 36 & 0xFFF, -vmax, vmax, 12),
-        from_code(word >> 24 & 0xFFF, 0.0, KP_MAX, 12),
-        from_code(word >> 12 & 0xFFF, 0.0, KD_MAX, 12),
+        from_code(word >> 24 & 0xFFF, 0.0, 500.0, 12),  # N m/rad
+        from_code(word >> 12 & 0xFFF, 0.0, 5.0, 12),  # N m s/rad
         from_code(word & 0xFFF, -tmax, tmax, 12),
     )
 
@@ -91,14 +88,6 @@ def encode_feedback(
     for temperature in temperatures:
         word = word << 8 | min(max(int(temperature), 0), 255)
     return word.to_bytes(FRAME_BYTES, "big")
-
-
-def encode_register_reply(motor_id: int, what: int, register: int, value: float) -> bytes:
-    """The reply to a read (`what` is READ) or the echo of a write (WRITE)."""
-    head = bytes([motor_id & 0xFF, motor_id >> 8, what, register])
-    if register in INTEGER_REGISTERS:
-        return head + struct.pack("<I", int(value))
-    return head + struct.pack("<f", value)
 
 
 def data_frame(reply_id: int, data: bytes, fd: bool) -> can.Message:

@@ -50,12 +50,11 @@ STATUS = {
 }
 SPIKE_RAD, JUMP_RAD, LATE_NS = 0.5, 0.1, 3_000_000
 HOT_C = 130.0
-FAULT_STREAM = 1 << 33  # keeps the draws of faults apart from those of truth and noise
 
 
 def board_faults(texts: Iterable[str] = (), seed: int = 0) -> Faults:
     """Faults of the boards, and of a host's controller. Raises ValueError, naming the choices."""
-    return Faults(texts, KINDS | OF_HOSTS, (seed, FAULT_STREAM))
+    return Faults(texts, KINDS | OF_HOSTS, (seed, 1 << 33))  # apart from truth and noise
 
 
 class Outbox:

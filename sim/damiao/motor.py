@@ -24,9 +24,7 @@ OVER_TEMPERATURE, PMAX, VMAX, TMAX, CAN_BR = 2, 21, 22, 23, 35
 MOTOR_POSITION, OUTPUT_POSITION = 80, 81
 # What the motor measures or what it is; a write is answered with the value as it was.
 READ_ONLY = frozenset({13, 14, 15, 16, 17, 18, 19, 20, 36, 50, 51, 52, 53, 54, 55, 80, 81})
-TIMEOUT_UNIT_NS = 50_000  # one of two opinions on register 9; the other is 1 ms
 MIT_MODE = 1
-MODES = (1, 2, 3, 4)
 # Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
 AIR_C = 25.0
 ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
@@ -184,7 +182,7 @@ class Motor:
         if register in (PMAX, VMAX, TMAX):
             self.scale = FullScale(*(self.registers[k] for k in (PMAX, VMAX, TMAX)))
         elif register == TIMEOUT:
-            self._limit_ns = int(value) * TIMEOUT_UNIT_NS if value else NEVER_NS
+            self._limit_ns = int(value) * 50_000 if value else NEVER_NS  # ns
             self.deadline_ns = NEVER_NS
 
 
@@ -192,7 +190,7 @@ def _fits(register: int, value: float) -> bool:
     if register in INTEGER_REGISTERS:
         if register in (MST_ID, ESC_ID):
             return 0 < value <= 0x7FF  # a standard id
-        return register != CTRL_MODE or value in MODES
+        return register != CTRL_MODE or value in (1, 2, 3, 4)
     return math.isfinite(value) and (register not in (PMAX, VMAX, TMAX) or value > 0)
 
 

@@ -31,8 +31,6 @@ from sim.scenarios import Scenario, build
 from sim.truth import Array, Truth
 
 IDLE_S = 5e-3  # longest wait without frames: the arm goes on in steps of this
-ACTIVE_NS = 10_000_000  # so long after a frame the ticks keep their rhythm
-REPLY_OFFSET = 0x10  # reply id = command id + 0x10, as OpenArm sets it
 WARM_UP_TICKS = 20  # temperatures are slow: they move on every 20 ms
 
 
@@ -47,7 +45,7 @@ class MotorBank:
     def __init__(self, motors: str, world: World, faults: Faults) -> None:
         """Motors of a set, disabled. Raises ValueError, naming the choices."""
         self.motors = [
-            Motor(j, j + REPLY_OFFSET, kind, scale)
+            Motor(j, j + 0x10, kind, scale)  # as OpenArm sets it
             for j, (kind, scale) in enumerate(motor_set(motors), 1)
         ]
         self.frames: Counter[str] = Counter()
@@ -126,19 +124,21 @@ class MotorBank:
         if what == codec.SAVE:
             self.frames["save"] += 1
             # The layout is this simulator's choice, no source describes it.
-            return bytes([unit.motor_id & 0xFF, unit.motor_id >> 8, what, 1, 0, 0, 0, 0])
+            return struct.pack("<HBBI", unit.motor_id, what, 1, 0)
         if what not in (codec.READ, codec.WRITE):
             self.frames["unknown service"] += 1
             return None
         self.frames["register reads" if what == codec.READ else "register writes"] += 1
+        whole = register in codec.INTEGER_REGISTERS
+        kind = "<I" if whole else "<f"
         if what == codec.WRITE:
-            kind = "<I" if register in codec.INTEGER_REGISTERS else "<f"
             unit.write(register, struct.unpack(kind, data[4:])[0])
             self._index()
         value = unit.read(register, self._world.at(now_ns, j)[0])
         if value is None:
             return None
-        return codec.encode_register_reply(unit.motor_id, what, register, value)
+        head = struct.pack("<HBB", unit.motor_id, what, register)
+        return head + struct.pack(kind, int(value) if whole else value)
 
     def _feedback(self, j: int, now_ns: int, now_s: float) -> bytes:
         """What motor j (from 0) says of this instant."""
@@ -309,7 +309,7 @@ class Boards:
     def _patience_s(self) -> float:
         """How long to wait for a frame before the arm has to move on."""
         now = self._now_ns()
-        until = self.world.next_ns() if now - self._last_ns < ACTIVE_NS else now + IDLE_S * 1e9
+        until = self.world.end_ns if now - self._last_ns < 10_000_000 else now + IDLE_S * 1e9
         due = self._outbox.next_ns()
         until = until if due is None else min(until, due)
         return min(max((until - now) * 1e-9, 0.0), IDLE_S)
@@ -333,7 +333,7 @@ class Boards:
         """
         self._advance(self._now_ns())
         self._last_ns = self._now_ns()
-        if self._last_ns >= self.world.next_ns():
+        if self._last_ns >= self.world.end_ns:
             self._advance(self._last_ns)
         if self._first_ns is None:
             self._first_ns = self._last_ns
@@ -408,7 +408,6 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 PERIOD_NS = round(PERIOD_S * 1e9)
-BEFORE_S = -1.0  # what the scenario's clock shows before it begins
 MOST_TICKS_AT_ONCE = 100  # of a backlog; beyond it the simulated world slips
 
 
@@ -424,6 +423,7 @@ class World:
 
     Attributes:
         held: the arm is in the stand.
+        end_ns: of the last tick, where the next one begins.
         slipped_ns: how far the simulated world has fallen behind the clock.
         ticks: simulated, those in the stand included.
         limp_ticks: of these, with at least one motor without torque and the arm not in the stand.
@@ -436,7 +436,7 @@ class World:
     ) -> None:
         self._n = truth.n
         self._engine = Engine(truth, end_stops=True)
-        self._end_ns = start_ns  # of the last tick
+        self.end_ns = start_ns  # of the last tick
         self.held = True
         self.slipped_ns = self.ticks = self.limp_ticks = self.stop_ticks = 0
         self.fastest = 0.0
@@ -464,17 +464,17 @@ class World:
                 and the feed-forward torques (n,) reached by then.
             t0_ns: when the scenario's time began; None if it has not.
         """
-        due = (now_ns - self._end_ns) // PERIOD_NS + 1
+        due = (now_ns - self.end_ns) // PERIOD_NS + 1
         if due <= 0:
             return
         if due > MOST_TICKS_AT_ONCE:
             late_ns = (due - MOST_TICKS_AT_ONCE) * PERIOD_NS
-            self._end_ns += late_ns
+            self.end_ns += late_ns
             self.slipped_ns += 0 if self.held else late_ns
             due = MOST_TICKS_AT_ONCE
         for _ in range(due):
-            self._law = law_at(self._end_ns, self._law.ff1)
-            self._engine.set_time(BEFORE_S if t0_ns is None else (self._end_ns - t0_ns) * 1e-9)
+            self._law = law_at(self.end_ns, self._law.ff1)
+            self._engine.set_time(-1.0 if t0_ns is None else (self.end_ns - t0_ns) * 1e-9)
             self._tick()
 
     def at(self, now_ns: int, joint: int) -> tuple[float, float, float]:
@@ -482,7 +482,7 @@ class World:
 
         Position is cubic in time, with the speeds of both ends; speed is its derivative.
         """
-        x = min(max(1.0 + (now_ns - self._end_ns) / PERIOD_NS, 0.0), 1.0)
+        x = min(max(1.0 + (now_ns - self.end_ns) / PERIOD_NS, 0.0), 1.0)
         q0, q1, v0, v1, q_des, dq_des, kp, kd, ff0, ff1, most, *extra = self._columns[joint]
         step, rest = v0 * PERIOD_S, (v0 + v1) * PERIOD_S - 2 * (q1 - q0)
         bend = q1 - q0 - step - rest
@@ -494,18 +494,14 @@ class World:
 
     def state(self) -> tuple[int, Array, Array]:
         """End of the last tick, ns, with q (n,) rad and dq (n,) rad/s there."""
-        return self._end_ns, *self._to
-
-    def next_ns(self) -> int:
-        """When the next tick begins."""
-        return self._end_ns
+        return self.end_ns, *self._to
 
     def close(self) -> None:
         """Free the simulator; may be called more than once."""
         self._engine.close()
 
     def _tick(self) -> None:
-        self._end_ns += PERIOD_NS
+        self.end_ns += PERIOD_NS
         self.ticks += 1
         self._from = self._to
         if not self.held:

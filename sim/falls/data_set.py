@@ -31,7 +31,6 @@ from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
 PART = ".part"  # of files that are being written
-ABANDONED_S = 3600.0  # after which such a file is a killed run's
 FORMAT = 1  # of the files; a new one whenever what they hold is computed otherwise
 CACHE_VARIABLE = "PANDA_ADAPTER_CACHE"  # environment variable, folder
 SIGNALS = tuple(item.name for item in fields(FallRecord))
@@ -214,7 +213,7 @@ def data_set(
     place.mkdir(parents=True, exist_ok=True)
     for left in place.glob(f"*{PART}"):  # of a killed run; nobody writes at one file for so long
         with contextlib.suppress(FileNotFoundError):
-            if time.time() - left.stat().st_mtime > ABANDONED_S:
+            if time.time() - left.stat().st_mtime > 3600.0:  # s
                 left.unlink()
     key = _key(robot, flight)
     jobs = tuple(

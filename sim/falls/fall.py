@@ -18,8 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from sim.dynamics import Frames, compiled, link_motion
 from sim.rigid_bodies import disconnect, load_urdf
-from sim.truth import Array, Limits, body_of, facts_of, from_rpy, lam_of, theta_of
-from sim.urdf_writer import joint_text, link_text, principal
+from sim.truth import (
+    Array,
+    Limits,
+    body_of,
+    facts_of,
+    from_rpy,
+    joint_text,
+    lam_of,
+    link_text,
+    principal,
+    theta_of,
+)
 
 BASE = -1
 BOUNDS = ("lower", "upper", "velocity", "effort")  # of a joint, as its facts name them

@@ -20,15 +20,12 @@ from sim.scenarios import Scenario
 from sim.truth import FLANGE, Array
 
 # Ranges: Franka FCI documentation.
-STIFFEST = 14250.0  # N m/rad
-CARTESIAN_STIFFNESS = ((10.0, 3000.0), (1.0, 300.0))  # N/m, N m/rad
 FILTER_HZ = (1.0, 1000.0)
 CARTESIAN_DEFAULT = (3000.0, 3000.0, 3000.0, 300.0, 300.0, 300.0)  # N/m, N m/rad, as the next
 STIFFNESS = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)  # N m/rad, libfranka examples
 # Thresholds before a client sets any: chosen here, above what excitation with a hand needs.
 TORQUE_THRESHOLD = (40.0, 40.0, 36.0, 36.0, 10.0, 10.0, 10.0)  # N m
 FORCE_THRESHOLD = (80.0, 80.0, 80.0, 40.0, 40.0, 40.0)  # N, N m
-HEAVIEST_KG = 10.0  # no Franka arm carries half of it
 RIGID = 1e-5  # so far R^T R may be from the identity
 # Where the thresholds of collision begin in the payload, in numbers: the nominal phase counts,
 # since the simulated robot does not tell phases of acceleration apart.
@@ -88,13 +85,13 @@ class Settings:
         return True
 
     def _SetJointImpedance(self, x: Array) -> bool:
-        if (x < 0).any() or (x > STIFFEST).any():
+        if (x < 0).any() or (x > 14250.0).any():  # N m/rad
             return False
         self.stiffness = x
         return True
 
     def _SetCartesianImpedance(self, x: Array) -> bool:
-        lowest, highest = np.repeat(np.array(CARTESIAN_STIFFNESS), 3, axis=0).T
+        lowest, highest = np.repeat(np.array(((10.0, 3000.0), (1.0, 300.0))), 3, axis=0).T
         if (x < lowest).any() or (x > highest).any():
             return False
         self.cartesian_stiffness = x
@@ -112,7 +109,7 @@ class Settings:
     def _SetLoad(self, x: Array) -> bool:
         inertia = x[4:].reshape(3, 3)
         moments = np.linalg.eigvalsh((inertia + inertia.T) / 2)
-        wrong = not 0.0 <= x[0] <= HEAVIEST_KG or moments[0] < 0
+        wrong = not 0.0 <= x[0] <= 10.0 or moments[0] < 0  # kg
         if wrong or np.abs(inertia - inertia.T).max() > RIGID:
             return False
         self.load = float(x[0]), x[1:4], inertia
@@ -128,13 +125,10 @@ class Settings:
         return True
 
 
-SERVED_SUBSTEPS = 2  # of 0.5 ms: friction in four takes most of a millisecond on a slow machine
-EXTERNAL_HZ = 10.0  # low pass of the external torque; the robot's own is not published
-EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * EXTERNAL_HZ * TICK_S)
+EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * 10.0 * TICK_S)  # Hz, low pass of the external torque
 # The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
 # is what a command per millisecond holds stable on a rigid arm.
 FASTEST_RATE = 60.0  # 1/s
-SINGULAR = 0.01  # manipulability (m³, Yoshikawa) below which no wrench is told; 0.08 when ready
 
 
 class Arm:
@@ -156,7 +150,7 @@ class Arm:
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         self.truth = scenario.truth.with_changes(effects=())  # all that the robot knows
         self._motors = scenario.truth.motor_inertia
-        self.plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
+        self.plant: Plant = scenario.plant(substeps=2)  # four take too long on a slow machine
         self._n = self.truth.n
         self._still = np.zeros(self._n)
         self.refresh(settings)
@@ -268,7 +262,8 @@ class Arm:
     def _look(self) -> None:
         """Pose and external wrench at the present posture."""
         self.pose, self.jacobian = self.frame(self.q)
-        self.wrench = wrench_at(self.pose, self.jacobian, self._to_K, self.tau_external, SINGULAR)
+        least = 0.01  # manipulability (m³, Yoshikawa) that a wrench takes; 0.08 when ready
+        self.wrench = wrench_at(self.pose, self.jacobian, self._to_K, self.tau_external, least)
 
 
 @compiled

@@ -14,9 +14,7 @@ from sim.truth import Array, Limits, turn_about
 ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
 START_TOLERANCE = 1e-3  # m and rad, first pose from the desired one; the robot's is not published
 ELBOW_TOLERANCE = 1e-2  # rad, chosen
-REACHED = 1e-3  # m and rad, so far the joints may be from a pose; else it is out of reach
 RIGID = 1e-4  # so far R^T R of a pose may be from the identity
-ELBOW_SPEED = 2.175  # rad/s (Franka FCI documentation)
 JERK_PER_ACCELERATION = 500.0  # 1/s: 7500 rad/s³ at 15 rad/s² (Franka FCI documentation)
 # Differences over 1 ms of positions that the client had as f32 are off by up to 500 rad/s³
 # (and 2e-4 rad/s), which a motion along its limits shall not be blamed for.
@@ -112,7 +110,8 @@ class CartesianMotion:
         away = abs(elbow[0] - self.q[2])
         if self._fresh:
             return None if away <= ELBOW_TOLERANCE else START_ELBOW
-        return None if away <= ELBOW_TOLERANCE + ELBOW_SPEED * TICK_S else ELBOW
+        step = 2.175 * TICK_S  # rad/s (Franka FCI documentation)
+        return None if away <= ELBOW_TOLERANCE + step else ELBOW
 
     def _go(self, pose: Array, twist: Array, elbow: float) -> str | None:
         acceleration = (twist - self.twist) / TICK_S
@@ -126,7 +125,7 @@ class CartesianMotion:
             if not within(value, most):
                 return error
         q, missed = self._reach(self.q, pose, elbow)
-        if not missed <= REACHED:
+        if not missed <= 1e-3:  # m and rad
             return f"{OF_JOINTS}_position_limits_violation"
         before = self.q, self.dq, self.ddq
         self._take_joints(q)
@@ -177,18 +176,14 @@ def rigid(pose: Array) -> bool:
     return bool(straight and np.isfinite(pose).all() and (pose[3] == (0, 0, 0, 1)).all())
 
 
-def rotation_vector(R: Array) -> Array:
-    """(3,) axis times angle, rad; for angles below a half turn."""
-    v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    sine = np.sqrt(v @ v)
-    if sine < 1e-9:
-        return np.asarray(v)
-    return np.asarray(v * (np.arctan2(sine, (np.trace(R) - 1) / 2) / sine))
-
-
 def difference(old: Array, new: Array) -> Array:
     """(6,) translation and rotation vector from one pose to another, base axes."""
-    return np.concatenate((new[:3, 3] - old[:3, 3], rotation_vector(new[:3, :3] @ old[:3, :3].T)))
+    R = new[:3, :3] @ old[:3, :3].T
+    v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    sine = np.sqrt(v @ v)  # of less than a half turn
+    if sine >= 1e-9:
+        v = v * (np.arctan2(sine, (np.trace(R) - 1) / 2) / sine)
+    return np.concatenate((new[:3, 3] - old[:3, 3], v))
 
 
 def moved(pose: Array, twist: Array) -> Array:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 
-from drivers.process import sleep_until
+from drivers.process import pin, quiet_collector, request_fifo, sleep_until
 
 PERIOD_NS = 1_000_000
-ANSWER_NS = 500_000  # a client's own part of a period (Franka FCI documentation)
-SPIN_NS = 60_000  # waiting actively for the last part: a wake-up costs the system that much
 PRIORITY = 80  # of SCHED_FIFO: above any client loop but those that take 99
 
 
@@ -41,10 +37,10 @@ class Ticks:
     def wait(self) -> None:
         """Return at the next tick, to be called at the end of the one before."""
         now = self._now()
-        late = max(now + ANSWER_NS - self._due - PERIOD_NS, 0)
+        late = max(now + 500_000 - self._due - PERIOD_NS, 0)  # ns (Franka FCI documentation)
         self._slipped += late
         self._due += PERIOD_NS + late
-        wake = self._due - SPIN_NS
+        wake = self._due - 60_000  # a wake-up costs the system that much
         while now < wake:
             self._sleep(wake)
             now = self._now()
@@ -55,21 +51,9 @@ class Ticks:
 @contextmanager
 def undisturbed(core: int | None = None) -> Iterator[None]:
     """Priority, a core and no collector for the calling thread, as far as the system permits."""
+    asked = [request_fifo(PRIORITY), quiet_collector()]
     with ExitStack() as undo:
-        if core is not None:
-            before = os.sched_getaffinity(0)
-            with suppress(OSError, ValueError):
-                os.sched_setaffinity(0, {core})
-                undo.callback(os.sched_setaffinity, 0, before)
-        policy = os.sched_getscheduler(0), os.sched_getparam(0)
-        with suppress(OSError, ValueError):
-            fifo = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-            os.sched_setscheduler(0, fifo, os.sched_param(PRIORITY))
-            undo.callback(os.sched_setscheduler, 0, *policy)
-        if gc.isenabled():
-            gc.collect()
-            gc.freeze()
-            gc.disable()
-            undo.callback(gc.enable)
-            undo.callback(gc.unfreeze)
+        for _, back in asked if core is None else [pin({core}), *asked]:
+            if back is not None:
+                undo.callback(back)
         yield

@@ -49,7 +49,6 @@ KINDS = {
 }
 SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
 JUMP_RAD = 0.05
-ROBOT = {5: "panda", 10: "fr3"}  # by protocol
 AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
 
 
@@ -110,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def chosen(args: argparse.Namespace) -> dict[str, Any]:
     """The scenario's options; the arm is the one that speaks the protocol, if none is named."""
-    return {"robot": ROBOT[args.protocol]} | options_of(args.set)
+    return {"robot": {5: "panda", 10: "fr3"}[args.protocol]} | options_of(args.set)
 
 
 def check(args: argparse.Namespace) -> None:

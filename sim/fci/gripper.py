@@ -104,9 +104,8 @@ class Fingers:
             else:
                 self.width += speed * left_s * (1.0 if goal > self.width else -1.0)
             left_s -= needed_s
-        return None if self._goals else self._ended()
-
-    def _ended(self) -> Status:
+        if self._goals:
+            return None
         if self._accepted is None:
             return Status.SUCCESS
         (least, most), self._accepted = self._accepted, None
@@ -150,10 +149,14 @@ class GripperServer:
         ended = self.fingers.go_on(now_s)
         if ended is not None:
             self._finish(ended)
-        if self._tcp is None:
-            self._accept()
+        if self._tcp is not None:
+            self._listen(self._tcp)
         else:
-            self._listen()
+            with suppress(OSError):  # nobody comes
+                self._tcp, _ = self._listener.accept()
+                self._tcp.setblocking(False)
+                self._tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self.clients += 1
         if self._states_to is not None and now_s >= self._due_s:
             self._due_s = now_s + 0.01  # chosen; the hand's own is not published
             self._message_id += 1
@@ -168,19 +171,9 @@ class GripperServer:
         self._udp.close()
         self._listener.close()
 
-    def _accept(self) -> None:
+    def _listen(self, tcp: socket.socket) -> None:
         try:
-            self._tcp, _ = self._listener.accept()
-        except OSError:
-            return
-        self._tcp.setblocking(False)
-        self._tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.clients += 1
-
-    def _listen(self) -> None:
-        assert self._tcp is not None
-        try:
-            data = self._tcp.recv(4096)
+            data = tcp.recv(4096)
         except BlockingIOError:
             return
         except OSError:

@@ -316,7 +316,6 @@ def _elbow(field: Floats, q: Array) -> None:  # position of joint 3, side of joi
     field[0], field[1] = q[2], 1.0 if q[3] > ELBOW_FLIP else -1.0
 
 
-START_TOLERANCE = 1e-3  # rad, first position from q_d; the robot's own is not published
 WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
 # Until the first command the client still changes over from replies to states. Chosen here: longer
 # than 20 ms, since a client on a machine without real-time kernel may be held up just then.
@@ -341,7 +340,7 @@ class DesiredMotion:
         """Take a command, of which the kind's part counts; the error that it commits, if any."""
         q, dq = command.q, command.dq
         if self._kind == Generator.JOINT_POSITION:
-            if self._fresh and not (np.abs(q - self.q) <= START_TOLERANCE).all():
+            if self._fresh and not (np.abs(q - self.q) <= 1e-3).all():  # rad
                 return "joint_position_motion_generator_start_pose_invalid"
             return self._go(q.copy(), (q - self.q) / TICK_S)
         return self._go(self.q + dq * TICK_S, dq.copy())

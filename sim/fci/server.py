@@ -55,13 +55,7 @@ from sim.fci.gripper import GripperServer
 from sim.fci.robot import Reporter, Robot
 from sim.options import Ending, sum_up
 from sim.scenarios import Scenario, build
-from sim.truth import FLANGE_M, Truth, body_of
-from sim.urdf_writer import joint_text, limit_text, link_text
-
-CHUNK = 4096  # bytes at a time; the longest request has 428
-MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it is dropped
-QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
-IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
+from sim.truth import FLANGE_M, Truth, body_of, joint_text, limit_text, link_text
 
 
 class ClientSession:
@@ -103,7 +97,7 @@ class ClientSession:
     def requests(self, answer: Callable[[Request], bytes | None]) -> None:
         """Answer what has come in over TCP; a client that leaves or talks nonsense is dropped."""
         try:
-            data = self._tcp.recv(CHUNK)
+            data = self._tcp.recv(4096)
             if not data:
                 self.close()
                 return
@@ -122,7 +116,7 @@ class ClientSession:
         """Send over TCP, now or when the client's buffer has room again."""
         self._out += data
         self._flush()
-        if len(self._out) > MOST_HELD:
+        if len(self._out) > 16 << 20:  # bytes that a client does not fetch
             self.close()
 
     def send(self, state: bytes | bytearray) -> None:
@@ -151,7 +145,7 @@ class ClientSession:
         found = None
         if self._udp is None:
             return None
-        for _ in range(QUEUE):
+        for _ in range(64):  # more would be a flood
             try:
                 data = self._udp.recv(COMMAND_BYTES[10] + 1)
             except BlockingIOError:
@@ -239,7 +233,7 @@ class FciServer:
             raise
         truth = self.robot.arm.truth
         # What a client gets as a model: a library for x64 Linux, or URDF.
-        self._model = model_library(truth) if protocol == 5 else robot_urdf(truth).encode()
+        self._model = _built(model_source(truth)) if protocol == 5 else robot_urdf(truth).encode()
         self._reporter = Reporter(self.robot)
         self._reporter.refresh()
         self._reporter.fill(0)  # what is compiled on first use is compiled before a client comes
@@ -259,7 +253,7 @@ class FciServer:
             self._ticks.restart()
             while not stop():
                 if self._session is None and not self.robot.moving:
-                    wait_s = IDLE_S if self.hand is None else 0.01  # s, as often as it has a state
+                    wait_s = 0.05 if self.hand is None else 0.01  # s, as often as it has a state
                     select.select([self._listener], [], [], wait_s)
                     self._ticks.restart()
                     if self.hand is not None:
@@ -302,16 +296,6 @@ class FciServer:
             self.hand.close()
         self.robot.arm.plant.close()
 
-    def _answer_to_state(self, session: ClientSession) -> RobotCommand | None:
-        """The client's command of this tick; the world slips while one that is owed is late."""
-        if not (self._owed and self._patient):
-            return session.command(self._id)
-        try:
-            return session.wait_for_command(self._id, self._patience_s)
-        except TimeoutError:
-            self._patient = False
-            return None
-
     def _one_tick(self) -> None:
         """Command in, world on, state out."""
         self._tick += 1
@@ -319,7 +303,13 @@ class FciServer:
         session, robot, command = self._session, self.robot, None
         if session is not None:
             before = self._unused["stale"]
-            command = self._answer_to_state(session)
+            if self._owed and self._patient:  # the world slips while one that is owed is late
+                try:
+                    command = session.wait_for_command(self._id, self._patience_s)
+                except TimeoutError:
+                    self._patient = False
+            else:
+                command = session.command(self._id)
             # It may be late from its very first command on, which then answers no tick.
             self._answering = robot.motion is not None and (
                 self._answering or robot.motion.begun or self._unused["stale"] > before
@@ -450,7 +440,6 @@ _HEAD = """#include <math.h>
 """
 COMPILER = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
 OPTIONS = ("-O2", "-shared", "-fPIC", "-x", "c", "-", "-lm")
-TIMEOUT_S = 60.0
 
 
 def model_source(truth: Truth) -> str:
@@ -483,13 +472,9 @@ def _frames() -> list[str]:
     return out
 
 
-def model_library(truth: Truth) -> bytes | None:
-    """The library's bytes; None without a C compiler, or where it does not build for x64 Linux."""
-    return _built(model_source(truth))
-
-
 @cache
 def _built(source: str) -> bytes | None:
+    """The library's bytes; None without a C compiler, or where it does not build for x64 Linux."""
     if COMPILER is None or (platform.system(), platform.machine()) != ("Linux", "x86_64"):
         return None
     with tempfile.TemporaryDirectory() as work:
@@ -499,7 +484,7 @@ def _built(source: str) -> bytes | None:
                 [COMPILER, *OPTIONS, "-o", str(built)],
                 input=source.encode(),
                 capture_output=True,
-                timeout=TIMEOUT_S,
+                timeout=60.0,
                 check=True,
             )
         except (OSError, subprocess.SubprocessError):

@@ -33,8 +33,7 @@ from sim.fci.clock import PRIORITY, Ticks, undisturbed
 from sim.options import Ending, options_of, sum_up
 from sim.ros2.options import KINDS
 from sim.scenarios import Scenario, build
-from sim.truth import Truth
-from sim.urdf_writer import joint_text, limit_text
+from sim.truth import Truth, joint_text, limit_text
 
 LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces>
 <NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
@@ -42,7 +41,6 @@ LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces>
 <MaxAutoParticipantIndex>64</MaxAutoParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers>
 </Discovery></Domain></CycloneDDS>"""
 FINGERS = {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02}
-SUBSTEPS = 2
 OFF_RAD = 0.5  # by which a joint is wrong where faults say so
 SECOND_NS = 1_000_000_000
 
@@ -104,7 +102,7 @@ class ServedArm:
 
     def __init__(self, scenario: Scenario, place: Place, faults: Sequence[str] = ()) -> None:
         self._place, self._faults = place, Faults(faults, KINDS, (scenario.seed, 5))
-        self._plant = scenario.plant(substeps=SUBSTEPS)
+        self._plant = scenario.plant(substeps=2)
         with suppress(OSError):  # the threads of DDS inherit it: a machine that is busy delays them
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         self._domain = Domain(place.domain, LOOPBACK)

@@ -17,8 +17,7 @@ from scipy.signal import lfilter
 from sim.effects import Effect
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
-from sim.truth import ATTEMPTS, Array, Truth, panda, wrong_bodies
-from sim.urdf_writer import urdf
+from sim.truth import ATTEMPTS, Array, Truth, panda, urdf, wrong_bodies
 from tests.hidden.motion import DrawnMotion, draw_motion
 from tests.hidden.sizes import (
     CATALOGUE,

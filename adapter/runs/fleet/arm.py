@@ -26,7 +26,6 @@ from adapter.runs.outcome import Outcome, collect, learned_model
 
 ROUNDS = 5  # of who agrees to the model that these make
 LEAST_LOAD_KG, LOAD_STD = 0.05, 4.0  # less than this, or so many standard deviations, is no load
-TIMES_WORSE = 1.5  # than its own best fit and than other logs: one that disagrees
 FEWEST_TO_COMPARE = 3  # logs
 DAY_S = 86_400.0
 TIME = "time"  # the column that every log has
@@ -302,7 +301,7 @@ def _worse(log: OfLog, usual: Array, logs: int) -> tuple[int, ...]:
     least = np.maximum(usual, log.own_rmse)
     count = max(log.moments.count, 1.0)
     chance = chi2.sf(count * np.square(log.rmse / np.maximum(least, TINY)), count)
-    worse = (log.rmse > TIMES_WORSE * least) & (chance * logs * len(usual) < CHANCE)
+    worse = (log.rmse > 1.5 * least) & (chance * logs * len(usual) < CHANCE)
     return tuple(int(j) + 1 for j in np.flatnonzero(worse))
 
 

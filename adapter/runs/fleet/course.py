@@ -25,8 +25,6 @@ from adapter.model.spatial import Array
 
 FEWEST = 5  # numbers that a line, or what stands out beside others, takes
 CHANCE = 0.01  # of one false alarm among all that is asked of an arm
-FARTHEST = 3.0  # standard deviations that a scatter counts for away from the usual one
-MOST_FREEDOM = 16.0  # what all say of one, as so many numbers of its own; more, and a tail counts
 TINY = 1e-300
 Used = Sequence[NDArray[np.bool_]]
 
@@ -254,10 +252,10 @@ class Usual(NamedTuple):
         half = 0.5 * np.array([x.freedom for x in there])
         logs = np.log([x.scatter for x in there]) - digamma(half) + np.log(half)
         by_chance = polygamma(1, half)
-        middle, widest = np.median(logs), FARTHEST * np.sqrt(by_chance)
+        middle, widest = np.median(logs), 3.0 * np.sqrt(by_chance)  # standard deviations
         logs = np.clip(logs, middle - widest, middle + widest)
         more = float(np.var(logs, ddof=1) - np.mean(by_chance))
-        most = 0.5 * MOST_FREEDOM
+        most = 8.0  # half of as many numbers of its own; more, and a tail counts
         if more <= polygamma(1, most):
             own = most
         else:

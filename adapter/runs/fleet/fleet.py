@@ -373,7 +373,6 @@ Done = Iterator[tuple[Task, Result | Broken]]
 TRIES = 2  # of a task whose process died, in a process of its own
 AT_HAND = 2  # tasks of each process: one that it does, and the next
 ANSWER_S, WORKER_S = 10.0, 60.0  # until nobody is there; until no worker is
-CONNECTIONS = 3  # with a scheduler that is lost again and again
 
 
 def here(function: Callable[[Task], Result], tasks: Sequence[Task], workers: int) -> Done[Result]:
@@ -471,7 +470,7 @@ def on_cluster(
         ) from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said here
     left = dict.fromkeys(tasks)
-    for number in range(CONNECTIONS):
+    for number in range(3):  # a scheduler that is lost again and again
         try:
             client = distributed.Client(address, timeout=ANSWER_S)
         except (OSError, ValueError, ImportError) as error:

@@ -31,8 +31,6 @@ from drivers.files.mcap.writer import LINK_ACCELS, LINK_TWISTS
 from drivers.files.ros_types import ACCEL_STAMPED, IMU, ODOMETRY, TWIST_STAMPED
 from drivers.interface import Array
 
-LONGEST_PERIODS = 3.0  # of the sensor; no line is drawn across a longer silence
-MENTIONED = 0.05  # share of messages outside the joint samples' time that is worth a sentence
 _MOST_MATCHED = 0.9  # share of a topic's stamps that joint samples have; below, stamps are its own
 _W, _W_UNKNOWN = slice(13, 16), 16  # of the run of doubles, and where its covariance begins
 _A, _A_UNKNOWN = slice(25, 28), 28
@@ -78,7 +76,7 @@ class Carrier:
             )
             return None
         missed = len(own) - int(close.sum())
-        if missed > MENTIONED * len(own):
+        if missed > 0.05 * len(own):
             self.warnings.append(
                 f"{self.path}: {name}: {missed} of {len(own)} messages are near no joint sample; "
                 "left out"
@@ -135,7 +133,7 @@ def _slopes(t_s: Array, x: Array) -> Array:
     step = np.diff(t_s)
     if not step.size:
         return np.zeros_like(x)
-    near = step <= LONGEST_PERIODS * np.median(step)
+    near = step <= 3.0 * np.median(step)  # no line across a longer silence
     rate = np.where(near[:, None], np.diff(x, axis=0) / step[:, None], 0.0)
     none = np.zeros((1, x.shape[1]))
     sides = np.concatenate([[0], near]) + np.concatenate([near, [0]])

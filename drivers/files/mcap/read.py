@@ -45,7 +45,6 @@ from drivers.interface import Array, DriverError
 
 Beside = Literal["", "sensors", "frames", "imus"]
 IN_MEMORY = 2**17  # samples; the arrays of a longer recording are mapped
-GLANCE_S = 5.0  # that tell of most recordings that they are of another kind
 
 
 def read_log(
@@ -174,7 +173,7 @@ def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
             controllers tell both.
     """
     glance = open_scan(Path(path))
-    glance.within_s = (0.0, GLANCE_S)  # a long recording is not held in memory for that
+    glance.within_s = (0.0, 5.0)  # a long recording is not held in memory for that
     pair = _commanded(glance, topic)
     if pair is None:
         return None
