@@ -78,6 +78,7 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
         slides=tuple(whole.tree.slides[k] for k in kept),
     )
     rows = [0, *(k + 1 for k in kept)]
+    frames, tool = _riding(whole, carrier, placement, at)
     names = {whole.tree.joint_names[k]: value for k, value in at.items()}
     changed = replace(
         whole,
@@ -88,9 +89,9 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
         theta_std=np.sqrt(variance[rows]),
         limits=Limits(*(getattr(whole.limits, key)[kept] for key in LIMITS)),
         axis=whole.axis[kept],
-        frames=_frames(whole, carrier, placement, at),
+        frames=frames,
         source=source,
-        tool=_tool(whole, carrier, placement),
+        tool=tool,
         effects=tuple(e for entry in whole.effects for e in _effect(entry, kept)),
         provenance={**whole.provenance, LOCKED: {**whole.provenance.get(LOCKED, {}), **names}},
         lam_identifiable=None,
@@ -130,12 +131,13 @@ def _joint_frames(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[Arra
     return changed[kept], moved
 
 
-def _frames(
+def _riding(
     model: SelfModel, carrier: Mapping[int, int], placement: Placement, at: Mapping[int, float]
-) -> tuple[FixedFrame, ...]:
+) -> tuple[tuple[FixedFrame, ...], Tool | None]:
+    """Frames and tool on the links that are left."""
     names = {BASE: model.tree.base_name, **dict(enumerate(model.tree.link_names))}
     number = {name: k for k, name in names.items()}
-    riding = []
+    riding, tool = [], model.tool
     for frame in model.frames:
         r, p = placement[number[frame.parent]]
         parent = names[carrier[number[frame.parent]]]
@@ -146,18 +148,12 @@ def _frames(
         r, p = placement[k]
         r = r @ z_to_axis(model.axis[k]).T  # as the file has it, not turned to the axis
         riding.append(FixedFrame(names[k], joint, names[carrier[k]], r, p))
-    return tuple(riding)
-
-
-def _tool(model: SelfModel, carrier: Mapping[int, int], placement: Placement) -> Tool | None:
-    if model.tool is None:
-        return None
-    names = (*model.tree.link_names, model.tree.base_name)  # index -1 is the base
-    k = names.index(model.tool_link)
-    k = BASE if names[k] == model.tree.base_name else k
-    r, p = placement[k]
-    com, inertia = p + r @ model.tool.com, r @ model.tool.inertia @ r.T
-    return Tool(model.tool.mass, com, inertia, names[carrier[k]])
+    if tool is not None:
+        k = number[model.tool_link]
+        r, p = placement[k]
+        inertia = r @ tool.inertia @ r.T
+        tool = Tool(tool.mass, p + r @ tool.com, inertia, names[carrier[k]])
+    return tuple(riding), tool
 
 
 def _effect(entry: Mapping[str, Any], kept: Sequence[int]) -> list[dict[str, Any]]:

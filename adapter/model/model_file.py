@@ -93,6 +93,13 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         text = None if given.text is None else given.text.splitlines(keepends=True)
         lam = _numbers(given.lam)
         source = {"format": given.format, "file": given.file, "lambda": lam, "text": text}
+    posterior: dict[str, Any] | None = None
+    known = model.posterior
+    if known is not None:  # of the lower triangle what is not zero by its shape
+        root = [_numbers(row[: k + 1]) for k, row in enumerate(known.root)]
+        posterior = {"effects": _plain(known.effects), "least": _numbers(known.least)}
+        posterior |= {"root": root, "room": _numbers(known.room)}
+        posterior["lambda_root"] = _numbers(known.lam_root)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -113,7 +120,7 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         "theta": _numbers(model.theta),
         "theta_std": _numbers(model.theta_std),
         "theta_identifiable": _plain(model.theta_identifiable),
-        "posterior": None if model.posterior is None else _posterior_json(model.posterior),
+        "posterior": posterior,
         "base_theta": _numbers(model.base_theta),
         "effects": _plain(model.effects),
         "gravity": _numbers(model.gravity),
@@ -157,17 +164,6 @@ def _from_json(data: Mapping[str, Any]) -> SelfModel:
         provenance=_part(data, "provenance", dict, {}),
         **{key: value for key, value in optional.items() if value is not None},
     )
-
-
-def _posterior_json(posterior: Posterior) -> dict[str, Any]:
-    """Of the lower triangle what is not zero by its shape."""
-    return {
-        "effects": [list(label) for label in posterior.effects],
-        "least": _numbers(posterior.least),
-        "root": [_numbers(row[: k + 1]) for k, row in enumerate(posterior.root)],
-        "room": _numbers(posterior.room),
-        "lambda_root": _numbers(posterior.lam_root),
-    }
 
 
 def _posterior(data: Mapping[str, Any], n: int) -> Posterior:

@@ -213,7 +213,12 @@ class Doubt(NamedTuple):
         for turn in range(REDRAWN + 1):
             x = self.mean + rng.standard_normal((len(left), root.shape[1])) @ root.T
             way = room if turn < REDRAWN else self.mean - x  # at last back as far as they exist
-            x += _least_share(x, way, margin)[:, None] * way
+            low, high = np.zeros(len(x)), np.where(_exist(x, margin), 0.0, 1.0)
+            for _ in range(HALVED):  # the least share of the way after which they exist, if at all
+                middle = 0.5 * (low + high)
+                good = _exist(x + middle[:, None] * way, margin)
+                low, high = np.where(good, low, middle), np.where(good, middle, high)
+            x += high[:, None] * way
             good = _exist(x, margin)
             out[left[good]], left = x[good], left[~good]
         others = out[:, size:]  # beyond a bound they are as far on this side of it
@@ -226,13 +231,3 @@ def _exist(x: Array, margin: Array) -> NDArray[np.bool_]:
     """(m,) whether bodies, the first numbers of rows x (m, p), are inside by a margin (bodies,)."""
     bodies = x[:, : 10 * len(margin)].reshape(len(x), len(margin), 10)
     return np.asarray((min_eigenvalue(bodies) > margin).all(axis=1))
-
-
-def _least_share(x: Array, way: Array, margin: Array) -> Array:
-    """(m,) of a way (p,) or (m, p), the least share after which bodies exist, if they do at all."""
-    low, high = np.zeros(len(x)), np.where(_exist(x, margin), 0.0, 1.0)
-    for _ in range(HALVED):
-        middle = 0.5 * (low + high)
-        good = _exist(x + middle[:, None] * way, margin)
-        low, high = np.where(good, low, middle), np.where(good, middle, high)
-    return high

@@ -21,7 +21,7 @@ from adapter.model.inertia import (
 )
 from adapter.model.robot_file import SLIDING, FileJoint, FileRobot
 from adapter.model.self_model import LIMITS, URDF, SelfModel, Source, base_inertia, turned_theta
-from adapter.model.spatial import Array, at_joints, quaternion_from_matrix, z_to_axis
+from adapter.model.spatial import Array, at_joints, z_to_axis
 from adapter.model.tree import BASE
 
 # What a joint of a file may have beside its limits; a format has some of them.
@@ -168,10 +168,3 @@ def check_possible(theta: Array, name: str) -> None:
 def six_named(tensor: Array) -> dict[str, float]:
     """The elements of a tensor (3, 3) by the names that URDF's <inertia> has for them."""
     return dict(zip(SIX, six_from_tensor(tensor).tolist(), strict=True))
-
-
-def principal(tensor: Array) -> tuple[Array, Array]:
-    """Principal moments (3,) of an inertia tensor and their axes, [w x y z] (4,)."""
-    moments, axes = np.linalg.eigh(tensor)
-    axes[:, 0] *= np.sign(np.linalg.det(axes))  # right-handed
-    return moments, quaternion_from_matrix(axes)

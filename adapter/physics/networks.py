@@ -54,14 +54,6 @@ class FrameMotion(NamedTuple):
         """From motion rows [v w a dw] (..., 12)."""
         return cls(*torch.from_numpy(rows).split(3, dim=-1))
 
-    def twist(self) -> Tensor:
-        """[v; w], (..., 6)."""
-        return torch.cat([self.v, self.w], dim=-1)
-
-    def accel(self) -> Tensor:
-        """[a; dw], (..., 6)."""
-        return torch.cat([self.a, self.dw], dim=-1)
-
 
 def joint_rotation(lam_j: Tensor) -> Tensor:
     """R0 = Rz(α) Rx(β) Rz(γ) of λ_j (..., 6): frame j in frame i at q = 0, (..., 3, 3)."""

@@ -57,14 +57,6 @@ class Reading(NamedTuple):
     rows: Rows
     numbers: int = 0
 
-    @property
-    def with_load(self) -> bool:
-        """Whether it is held against the model with any load.
-
-        A load bends a joint that is told otherwise towards the model, too: it is left out there.
-        """
-        return self.kind != "joint"
-
 
 class TorqueShares(NamedTuple):
     """How much of the model's torque each joint's effort holds, friction and offset left out.
@@ -314,8 +306,9 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
     found: list[Reading] = []
     while len(found) < 3:  # readings in one recording
         far = {loaded: telling.apart(rows, loaded) for loaded in (True, False)}
-        every = Readings(rows, telling)
-        nearer = [x for x in every if telling.apart(x.rows, x.with_load) < far[x.with_load]]
+        # with any load, but for a joint that is told otherwise: a load would bend that, too
+        loaded = ((x, x.kind != "joint") for x in Readings(rows, telling))
+        nearer = [x for x, any_load in loaded if telling.apart(x.rows, any_load) < far[any_load]]
         explained = [telling.explained(x.rows) for x in nearer]
         costs = [x.cost + NUMBER * y.numbers for x, y in zip(explained, nearer, strict=True)]
         if min(costs, default=np.inf) > now.cost - EVIDENCE:

@@ -185,7 +185,16 @@ def refuse(log: Log, model: SelfModel) -> Screened:
     renamed = not set(names) <= set(recorded)
     q, dq, ddq, tau = smoothed_rows(log)
     moving = moving_joints(q, dq)
-    _check_motion(log, names, q, dq, moving)
+    if not moving:
+        wide, fast = _extent(q, dq)
+        k, in_motion = int(np.argmax(wide)), np.abs(dq).max(axis=1) > 0.5 * MOVES_DQ
+        raise RecordingRefused(
+            RecordingFault.MOTION,
+            f"{log.path}: too little motion to tell anything: {names[k]} moves most, by "
+            f"{wide[k]:.2g} rad at {fast[k]:.2g} rad/s, and the arm is in motion for "
+            f"{in_motion.sum() * GRID_S:.2g} s; move {', '.join(names)} by at least {WANTED_RAD} "
+            f"rad with at least {WANTED_DQ} rad/s, all of them at once, for some 20 s.",
+        )
     dead = silent(log, names)
     torque = judged(log, model, (q, dq, ddq, tau), recorded if renamed else ())
     said = standing(names, moving, q, dq)
@@ -331,23 +340,6 @@ def moving_joints(q: Array, dq: Array, period_s: float = GRID_S) -> tuple[int, .
     long = (np.abs(dq) > 0.5 * MOVES_DQ).sum(axis=0) * period_s
     moves = (wide >= MOVES_RAD) & (fast >= MOVES_DQ) & (long >= 0.2)  # s
     return tuple(np.flatnonzero(moves).tolist())
-
-
-def _check_motion(
-    log: Log, names: Sequence[str], q: Array, dq: Array, moving: Sequence[int]
-) -> None:
-    if moving:
-        return
-    wide, fast = _extent(q, dq)
-    k = int(np.argmax(wide))
-    long = float((np.abs(dq).max(axis=1) > 0.5 * MOVES_DQ).sum() * GRID_S)
-    raise RecordingRefused(
-        RecordingFault.MOTION,
-        f"{log.path}: too little motion to tell anything: {names[k]} moves most, by "
-        f"{wide[k]:.2g} rad at {fast[k]:.2g} rad/s, and the arm is in motion for {long:.2g} s; "
-        f"move {', '.join(names)} by at least {WANTED_RAD} rad with at least {WANTED_DQ} rad/s, "
-        "all of them at once, for some 20 s.",
-    )
 
 
 def standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -> list[str]:

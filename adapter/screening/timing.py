@@ -109,14 +109,10 @@ class RecordingClock:
                 f"The signals stand still while the arm moves, {len(self.frozen)} times, longest "
                 f"for {1e3 * length:.3g} ms at {start:.2f} s."
             )
-        return [*said, *self._words_on_signals()]
-
-    def _words_on_signals(self) -> list[str]:
-        said = []
-        for signal, share in self.held.items():
+        for signal, held in self.held.items():
             if self.hold_lag_s(signal):
                 said.append(
-                    f"{signal} is updated at {(1 - share) * self.rate_hz:.4g} Hz only and held in "
+                    f"{signal} is updated at {(1 - held) * self.rate_hz:.4g} Hz only and held in "
                     f"between: on average it is {1e3 * self.hold_lag_s(signal):.2g} ms old."
                 )
         late, std = self.lateness_s, self.lateness_std_s
@@ -352,7 +348,13 @@ def _lateness(t: Array, q: Array, dq: Array, period_s: float) -> tuple[float, fl
     sos = butter(3, min(CUT_HZ, 0.1 / period_s), fs=1.0 / step_s, output="sos")
     if len(grid) * step_s < 1.0:
         return nothing
-    pick = _compared(t, grid, period_s)
+    # points of the grid, 10 ms apart, away from either end and from holes
+    pick = np.arange(0, len(grid), max(1, round(0.01 / (grid[1] - grid[0]))))
+    at = grid[pick]
+    clear = (at > t[0] + 0.3) & (at < t[-1] - 0.3)
+    for k in np.flatnonzero(np.diff(t) > max(HOLE_PERIODS * period_s, 0.02)):
+        clear &= (at < t[k] - 0.2) | (at > t[k + 1] + 0.2)
+    pick = pick[clear]
     if pick.size < FEWEST_COMPARED:
         return nothing
     table = np.column_stack([np.interp(grid, t, x) for x in np.concatenate([q, dq], axis=1).T])
@@ -367,18 +369,6 @@ def _lateness(t: Array, q: Array, dq: Array, period_s: float) -> tuple[float, fl
         late_s += float(np.clip(change, -0.05, 0.05))
         found = (late_s, std_s, gain)
     return found
-
-
-def _compared(t: Array, grid: Array, period_s: float) -> Index:
-    """Points of the grid, 10 ms apart, away from either end and from holes."""
-    every = max(1, round(0.01 / (grid[1] - grid[0])))
-    points = np.arange(0, len(grid), every)
-    wide = np.flatnonzero(np.diff(t) > max(HOLE_PERIODS * period_s, 0.02))
-    at = grid[points]
-    clear = (at > t[0] + 0.3) & (at < t[-1] - 0.3)
-    for k in wide:
-        clear &= (at < t[k] - 0.2) | (at > t[k + 1] + 0.2)
-    return points[clear]
 
 
 def _fit(rate: Array, dq: Array, step_s: float, pick: Index) -> tuple[float, float, Array]:

@@ -189,12 +189,6 @@ def unpacked(rules, memory):
 
 
 @jit
-def moves_so(moved, dq, dt_s):
-    """Whether a joint that moved so far, rad, within dt_s has the speed that it reads."""
-    return dt_s > 0.0 and abs(dq) < FASTEST and abs(moved - dq * dt_s) < SO_ALIKE * abs(dq) * dt_s
-
-
-@jit
 def judge(stamp, q, dq, tau, rules, memory):
     """Verdict on raw readings: GOOD, NON_FINITE, OUT_OF_RANGE or REPEATED, all those of `last`.
 
@@ -211,7 +205,9 @@ def judge(stamp, q, dq, tau, rules, memory):
     for j in range(q.shape[0]):
         if q[j] < lower[j] or q[j] > upper[j] or abs(tau[j]) > tau_max[j]:
             return Verdict.OUT_OF_RANGE
-        fast = fast or (abs(dq[j]) > dq_max[j] and not moves_so(q[j] - last[0, j], dq[j], dt_s))
+        moved_so = abs(q[j] - last[0, j] - dq[j] * dt_s) < SO_ALIKE * abs(dq[j]) * dt_s
+        so = dt_s > 0.0 and abs(dq[j]) < FASTEST and moved_so
+        fast = fast or (abs(dq[j]) > dq_max[j] and not so)
         same = same and q[j] == last[0, j] and dq[j] == last[1, j] and tau[j] == last[2, j]
     if same and not fast:
         return Verdict.REPEATED

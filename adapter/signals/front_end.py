@@ -57,8 +57,6 @@ SAID = {  # of the first sample of each kind; all others are counted
     Verdict.ENCODER_JUMP: "an encoder jumped",
     Verdict.BASE_UNHEARD: "nothing is known of the base's motion; the sample was refused",
 }
-# stamps of what has not been yet
-UNSEEN = (Mark.SATURATED_UNTIL, Mark.FIRST_MOVING, Mark.SEEN, Mark.AHEAD, Mark.DOUBTED, Mark.LAST)
 BASE = 9  # numbers of a floating base's motion in a sample, [v, w, a]
 FASTER = 1.1  # of the documented speed, which is then not the arm's: said, not refused
 
@@ -225,8 +223,8 @@ class FrontEnd:
         self._memory.last[:] = np.nan
         self._memory.bristles.place[:] = np.nan
         self._memory.filter.times[:] = NEVER
-        for mark in UNSEEN:
-            self._memory.marks[mark] = NEVER
+        unseen = Mark.SATURATED_UNTIL, Mark.FIRST_MOVING, Mark.SEEN, Mark.AHEAD, Mark.DOUBTED
+        self._memory.marks[[*unseen, Mark.LAST]] = NEVER
         self._signals, self._answers = np.empty((1, 3 * n + base)), np.zeros((1, 4), np.int64)
         self._records = self.layout.new(self._rules.states)
         self.refused: Counter[str] = Counter()
@@ -372,8 +370,6 @@ class FrontEnd:
         return f"{at}: {self.fault if reason == Verdict.ENCODER_JUMP else SAID[reason]}"
 
 
-Indices = NDArray[np.intp]
-
 # No link of an arm moves faster: m/s, rad/s, m/s², rad/s².
 MOTION_CAP = np.repeat([30.0, 60.0, 2e3, 2e4], 3)
 
@@ -388,7 +384,7 @@ class Raw(NamedTuple):
         links: twists and accels (m, n, 6), NaN where nothing was heard; None: of no link.
     """
 
-    rows: Indices
+    rows: NDArray[np.intp]
     q: Array
     dq: Array
     links: tuple[Array, Array] | None
@@ -420,14 +416,6 @@ class TwistSynthesis:
         motion = np.concatenate(raw.links, axis=2)
         said = np.asarray(~np.isnan(motion).all(axis=(1, 2)))
         records[:, KIND] = LinkMotionKind.NONE
-        self._measured(records, raw, said, motion)
-        silent = ~said[np.searchsorted(raw.rows, np.arange(len(records)))]
-        part = records[silent]
-        synthesize(self._frames, self._base, part)
-        records[silent] = part
-
-    def _measured(self, records: Array, raw: Raw, said: NDArray[np.bool_], motion: Array) -> None:
-        """Motion (m, n, 12) of samples whose links said something."""
         at, rows, motion = self.layout, raw.rows[said], motion[said]
         records[rows, at.motion_q], records[rows, at.motion_dq] = raw.q[said], raw.dq[said]
         records[rows, at.motion] = motion.reshape(len(rows), 12 * at.n)
@@ -435,6 +423,10 @@ class TwistSynthesis:
         # schema a sample short
         usable = (np.abs(motion) < MOTION_CAP).all(axis=(1, 2))  # false for NaN
         records[rows, KIND] = np.where(usable, LinkMotionKind.MEASURED, LinkMotionKind.NONE)
+        silent = ~said[np.searchsorted(raw.rows, np.arange(len(records)))]
+        part = records[silent]
+        synthesize(self._frames, self._base, part)
+        records[silent] = part
 
     def _of_imus(self, records: Array, raw: Raw) -> None:
         at, rows = self.layout, raw.rows

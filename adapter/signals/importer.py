@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from adapter.model.model_file import whole_file
 from adapter.signals import source_signals
 from adapter.signals.matching import corresponding, several
+from adapter.signals.recording import PLAUSIBLE
 from adapter.signals.source_table import lerobot_joints
 from drivers.errors import choices
 from drivers.files import mcap
@@ -29,7 +30,6 @@ from drivers.interface import Array, DriverError
 
 _OF_TABLES = {"columns": {}, "flat": False, "period_s": None, "episode": None}  # not given
 _MOVING = 1e-2  # rad/s, a median slope below it says nothing
-_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 _STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
 _SAGE = "state_motor", "control"  # files of a folder, .csv or .csv.gz: motion and commands
 
@@ -295,7 +295,7 @@ def velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array
         return []
     slope, said = np.nanmedian(slopes), np.nanmedian(np.abs(dq))
     ratio = said / slope if slope > _MOVING and said > 0 else 1.0
-    if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
+    if PLAUSIBLE < ratio < 1 / PLAUSIBLE:
         return []
     said = "the slope of the positions; are the units of q, dq and time right?"
     return [f"{where}: velocities are {ratio:.3g} times {said}"]

@@ -16,7 +16,7 @@ GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is c
 _LISTED = 10  # gaps and topics that are listed one by one
 _SLIDING_UNIT = {"q_rad": "m", "dq_rad_s": "m/s", "tau_nm": "N"}
 _FAST, RESTING = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
-_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
+PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
 def describe(
@@ -185,7 +185,7 @@ def _units(parts: list[mcap.Log], q: Array, dq: Array, tau: Array, slides: Seque
         return f"{said[0]}, no efforts"
     if not np.isfinite(ratio):
         said.append("velocities cannot be judged")
-    elif _PLAUSIBLE < ratio < 1.0 / _PLAUSIBLE:
+    elif PLAUSIBLE < ratio < 1.0 / PLAUSIBLE:
         said.append("velocities rad/s")
     else:
         said.append(f"velocities {ratio:.3g} times the slope of the positions")
@@ -265,7 +265,8 @@ def _duration_s(looked: _Looked) -> float:
 
 
 def _timing(looked: _Looked) -> dict[str, Any]:
-    steps_ms = np.concatenate([np.diff(part.stamp_ns) for part in looked.parts]) * 1e-6
+    steps_ns = np.concatenate([np.diff(part.stamp_ns) for part in looked.parts])
+    steps_ms, steps_s = steps_ns * 1e-6, steps_ns * 1e-9
     forward = steps_ms[steps_ms > 0]
     duration_s = _duration_s(looked)
     facts: dict[str, Any] = {
@@ -276,22 +277,16 @@ def _timing(looked: _Looked) -> dict[str, Any]:
         "backward_steps": int((steps_ms < 0).sum()),
         "period_ms": None,
         "jitter_ms": None,
-        "gaps": _gaps(looked),
     }
+    hole_s = GAP_S
     if forward.size:
         shares = {"min": 0, "p50": 50, "p99": 99, "max": 100}
         facts["period_ms"] = {k: float(np.percentile(forward, v)) for k, v in shares.items()}
         facts["jitter_ms"] = float(np.std(forward))
-    return facts
-
-
-def _gaps(looked: _Looked) -> dict[str, Any]:
-    first = looked.parts[0].stamp_ns[0]
-    steps_s = np.concatenate([np.diff(part.stamp_ns) for part in looked.parts]) * 1e-9
-    after_s = np.concatenate([part.stamp_ns[:-1] - first for part in looked.parts]) * 1e-9
-    forward = steps_s[steps_s > 0]
-    hole_s = max(GAP_S, _HOLE * float(np.median(forward))) if forward.size else GAP_S
+        hole_s = max(GAP_S, _HOLE * float(np.median(steps_s[steps_s > 0])))
     between = np.array(looked.holes).reshape(-1, 2)
+    first = looked.parts[0].stamp_ns[0]
+    after_s = np.concatenate([part.stamp_ns[:-1] - first for part in looked.parts]) * 1e-9
     steps_s, after_s = np.r_[steps_s, between[:, 1]], np.r_[after_s, between[:, 0]]
     places = np.flatnonzero(steps_s >= hole_s)
     places = places[np.argsort(after_s[places], kind="stable")]
@@ -299,4 +294,5 @@ def _gaps(looked: _Looked) -> dict[str, Any]:
         {"after_s": float(after_s[i]), "length_s": float(steps_s[i])} for i in places[:_LISTED]
     ]
     count, longest_s = int(places.size), float(steps_s.max(initial=0))
-    return {"longer_than_s": hole_s, "count": count, "longest_s": longest_s, "first": listed}
+    gaps = {"longer_than_s": hole_s, "count": count, "longest_s": longest_s, "first": listed}
+    return {**facts, "gaps": gaps}

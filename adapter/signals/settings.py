@@ -32,11 +32,9 @@ class FilterSettings:
     period_s: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name in ("bandwidth_hz", "dq_noise", "period_s"):
+        for name in ("bandwidth_hz", "dq_noise", "period_s", "dq_drive"):
             if getattr(self, name) is not None and not getattr(self, name) > 0.0:
                 raise SettingsError(f"filter.{name} must be above zero, got {getattr(self, name)}")
-        if self.dq_drive is not None and not self.dq_drive > 0.0:
-            raise SettingsError(f"filter.dq_drive must be above zero, got {self.dq_drive}")
         if self.dq_drive is None and self.bandwidth_hz > self.widest_hz * (1.0 + 1e-6):
             raise SettingsError(
                 f"filter.bandwidth_hz {self.bandwidth_hz} is too high at {1.0 / self.period_s:.0f} "

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -113,11 +112,6 @@ class _Stage:
             by_joint(last, n),
             ROUNDS if follow else 1,
         )
-
-    @cached_property
-    def reads_true(self) -> bool:
-        """Whether the torque sensors say what is."""
-        return not (self.sensors.gain.any() or self.sensors.delay_s.any() or self.shifts.laws)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +308,9 @@ class Effects:
     def driving(self, t: Array, read: Array) -> Array:
         """Driving torque (m, n) N m behind what the torque sensors read at t (m,) s."""
         stages = [self._stage(float(now)) for now in t]
-        if all(stage.reads_true for stage in stages) and not self._slow:
+        sensed = ((x.sensors, x.shifts.laws) for x in {*stages})
+        untrue = any(x.gain.any() or x.delay_s.any() or shifts for x, shifts in sensed)
+        if not untrue and not self._slow:
             return read
         read = read.copy()
         for active, a, b in self._slow:  # torques of which the sensors' low-passes leave these

@@ -34,14 +34,13 @@ FILES = {  # the words after a command, FILE being what cannot be used
 WITHOUT = {"sim", "experiment", "completion"}  # take no file as such
 EMPTY = ("empty.mcap", "empty.json", "empty.urdf", "empty.csv")
 USELESS = ("gone.mcap", "folder", "noise.mcap", *EMPTY)
-NOISE = bytes(range(256)) * 8
 
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of useless files, which is where the user is."""
     for name in USELESS[2:]:
-        (tmp_path / name).write_bytes(NOISE if name.startswith("noise") else b"")
+        (tmp_path / name).write_bytes(bytes(range(256)) * 8 if name.startswith("noise") else b"")
     (tmp_path / "folder").mkdir()
     monkeypatch.chdir(tmp_path)
     return tmp_path

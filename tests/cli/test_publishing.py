@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -91,14 +90,9 @@ def test_what_is_published_is_heard():
     assert "documented/panda_link0" in children
 
 
-def _noting(notes, view):
-    notes.append(view)
-
-
 def test_displays_share_a_process():
     notes: list = []
-    one = DisplayJob(lambda: partial(_noting, notes), period_s=0.5)
-    other = DisplayJob(lambda: partial(_noting, notes), period_s=0.1)
+    one, other = (DisplayJob(lambda: notes.append, period_s=x) for x in (0.5, 0.1))
     both = together([one, None, other])
     assert both.period_s == 0.1 and together([None, one]) is one and together([None]) is None
     both.make()("a view")

@@ -12,7 +12,6 @@ import threading
 import time
 import urllib.request
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -71,18 +70,14 @@ class Terminal:
         os.close(self._master)
 
 
-def state_of(address: str) -> dict[str, Any]:
-    with urllib.request.urlopen(f"{address}state", timeout=60) as answer:
-        return json.load(answer)
-
-
 def test_a_run_on_a_terminal_and_on_its_page(tmp_path: Path) -> None:
     out = str(tmp_path)
     terminal = Terminal("run", "--duration", "3", "--seed", "5", "--view", "0", "--out", out)
     try:
         address = terminal.wait_for(r"watch it: (http://127\.0\.0\.1:\d+/)").group(1)
         terminal.wait_for(r"panda_joint7 +[−\d]")  # the table, with a torque
-        told = state_of(address)
+        with urllib.request.urlopen(f"{address}state", timeout=60) as answer:
+            told = json.load(answer)
         assert told["hello"]["robot"] == "panda" and told["hello"]["duration_s"] == 3.0
         assert terminal.process.wait(START_S) == 0
     finally:

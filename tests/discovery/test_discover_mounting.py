@@ -124,16 +124,11 @@ def test_links_that_keep_the_convention_tell_the_direction() -> None:
     assert set(named.mountings) == turned - {case.root}
 
 
-@cache
-def _found_panda() -> tuple[Case, Discovery]:
-    case = _case("panda", 0)
-    return case, discover(case.log)
-
-
 @pytest.mark.parametrize("name", ["panda", "atlas"])
 def test_mountings_and_lambda_are_true(name: str) -> None:
     """Whatever the gauge: axes, and where each joint's axis lies between two sensors."""
-    case, found = _found_panda() if name == "panda" else _named_atlas()
+    panda = _case("panda", 0)
+    case, found = (panda, discover(panda.log)) if name == "panda" else _named_atlas()
     learned = learn(found)
     for link, mounting in found.mountings.items():
         turn, place = case.mounts[case.body[link]]
@@ -228,15 +223,11 @@ def test_angles_that_wrap_and_sensors_with_stamps_of_their_own() -> None:
     wrapped = replace(log, q=(log.q + np.pi) % (2 * np.pi) - np.pi)
     assert set(confidences(discover(wrapped))) == case.edges
     case = _case("panda", 0)
-    assert set(confidences(discover(_interleaved(case.log)))) == case.edges
-
-
-def _interleaved(log: Log) -> Log:
-    """Joints at every other stamp, links at those between."""
+    log = case.log  # joints at every other stamp, links at those between
     even = (np.arange(len(log)) % 2 == 0)[:, None]
     joints = {k: np.where(even, getattr(log, k), np.nan) for k in ("q", "dq", "tau")}
     links = {k: np.where(even[..., None], np.nan, getattr(log, k)) for k in ("twists", "accels")}
-    return replace(log, **joints, **links)
+    assert set(confidences(discover(replace(log, **joints, **links)))) == case.edges
 
 
 def test_late_sensors_make_edges_doubtful_not_wrong() -> None:
@@ -267,7 +258,6 @@ def test_a_sliding_joint_is_never_trusted_to_turn() -> None:
 
 FINE = Motion(seconds=3.0, rate_hz=2000.0)  # joints take every other sample, sensors those between
 EVERY = 10  # 200 Hz
-JITTER_NS = 200_000  # of all stamps
 
 
 @cache
@@ -282,7 +272,7 @@ def _write(
     """Joint states at 1 kHz and each link's Imu at 200 Hz, by another encoder than ours."""
     rng = np.random.default_rng(4)
     log = case.log
-    stamp_ns = log.stamp_ns + JITTER_NS * rng.normal(size=len(log))
+    stamp_ns = log.stamp_ns + 200_000 * rng.normal(size=len(log))  # jitter of all stamps
     messages = []
     for i, at in enumerate((1e-9 * stamp_ns).tolist()):
         if i % 2 == 0:

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -64,13 +65,13 @@ RIGS = [
     Rig("log", log, ends=True, moves=False),
     Rig("example", example, steady=False),
     Rig("example_listening", example_listening, moves=False, steady=False),
-    Rig("fci_5", fci(5, True), steady=False, wire=True),
-    Rig("fci_10", fci(10, True), steady=False, wire=True),
-    Rig("fci_listening", fci(10, False), moves=False, steady=False, wire=True),
+    Rig("fci_5", partial(fci, 5, True), steady=False, wire=True),
+    Rig("fci_10", partial(fci, 10, True), steady=False, wire=True),
+    Rig("fci_listening", partial(fci, 10, False), moves=False, steady=False, wire=True),
     Rig("can_line", can_line),
     Rig("can_multicast", can_multicast, steady=False, wire=True),
-    Rig("ros2", ros2(True), steady=False, wire=True),
-    Rig("ros2_listening", ros2(False), moves=False, steady=False, wire=True),
+    Rig("ros2", partial(ros2, True), steady=False, wire=True),
+    Rig("ros2_listening", partial(ros2, False), moves=False, steady=False, wire=True),
 ]
 
 

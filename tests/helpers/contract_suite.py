@@ -23,7 +23,6 @@ from tests.helpers.patience import connect, patient_read, patiently
 
 READS = 200  # samples of a check
 STILL_READS, MOST_READS = 15, 3000
-LONGEST_NOTE = 300  # characters
 
 Start = Callable[[], Driver]
 T = TypeVar("T")
@@ -159,18 +158,6 @@ def it_connects_again_or_says_why_not(rig: Rig, make: Make) -> None:
     arm.close()
 
 
-def check_sample(arm: Driver, sample: JointSample) -> None:
-    """Shapes and types of one sample."""
-    n = len(arm.joint_names)
-    assert isinstance(sample, JointSample) and type(sample.stamp_ns) is int
-    for values in (sample.q, sample.dq, sample.tau):
-        assert values.shape == (n,) and values.dtype == np.float64
-    if sample.links is not None:
-        assert len(arm.link_names) == n
-        for values in (sample.links.twist, sample.links.accel):
-            assert values.shape == (n, 6) and values.dtype == np.float64
-
-
 def samples_are_as_promised(rig: Rig, make: Make) -> None:
     """In order and finite; behind faults so but for as many as were put in, and no others."""
     if rig.faulty:  # whose account counts from the connection on
@@ -180,8 +167,15 @@ def samples_are_as_promised(rig: Rig, make: Make) -> None:
     else:
         arm = make.connected()
         samples = [patient_read(arm) for _ in range(READS)]
+    n = len(arm.joint_names)
     for sample in samples:
-        check_sample(arm, sample)
+        assert isinstance(sample, JointSample) and type(sample.stamp_ns) is int
+        for values in (sample.q, sample.dq, sample.tau):
+            assert values.shape == (n,) and values.dtype == np.float64
+        if sample.links is not None:
+            assert len(arm.link_names) == n
+            for values in (sample.links.twist, sample.links.accel):
+                assert values.shape == (n, 6) and values.dtype == np.float64
     steps = np.diff([sample.stamp_ns for sample in samples])
     if rig.faulty:
         check_faults(rig, arm, samples, steps)
@@ -298,7 +292,7 @@ def the_intake_balances(rig: Rig, make: Make) -> None:
     assert intake.used > 0 and intake.lost >= 0
     assert all(reason and count >= 0 for reason, count in intake.refused.items())
     for note in intake.notes:
-        assert note.strip() and "\n" not in note and len(note) <= LONGEST_NOTE
+        assert note.strip() and "\n" not in note and len(note) <= 300
     assert len(set(intake.notes)) == len(intake.notes)
 
 

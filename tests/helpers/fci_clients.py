@@ -60,7 +60,9 @@ def robot(protocol: int, *faults: str, patience_s: float = PATIENCE_S, more: tup
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])
         try:
-            _wait_until_ready(process, protocol)
+            ready = f"ready: a simulated arm on fci://127.0.0.1 (protocol {protocol})"
+            started = any(line.strip() == ready for line in process.stdout)
+            assert started, f"the simulated robot did not start: exit {process.wait()}"
 
             def end() -> dict:
                 process.terminate()
@@ -84,14 +86,6 @@ def client(protocol: int, *actions: str) -> dict[str, dict]:
     done = subprocess.run(command, capture_output=True, text=True, timeout=CLIENT_S)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def _wait_until_ready(process: subprocess.Popen, protocol: int) -> None:
-    ready = f"ready: a simulated arm on fci://127.0.0.1 (protocol {protocol})"
-    for line in process.stdout:
-        if line.strip() == ready:
-            return
-    raise AssertionError(f"the simulated robot did not start: exit {process.wait()}")
 
 
 @contextlib.contextmanager

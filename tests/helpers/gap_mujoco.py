@@ -25,6 +25,7 @@ from tests.helpers.gap_effects import (
     torque_sensor,
 )
 from tests.helpers.gap_tools import recorded
+from tests.helpers.robot_models import text_of
 from tests.hidden import Trial
 
 H_S, SUBSTEPS = 0.5e-3, 2
@@ -47,7 +48,7 @@ def mjcf(truth: Truth, armature: Array) -> str:
     """The arm as MuJoCo XML, frames and bodies as in the truth."""
     head = (
         f'<mujoco><compiler angle="radian" autolimits="false"/><option timestep="{H_S}"'
-        f' integrator="implicitfast" gravity="{_text(truth.gravity)}">'
+        f' integrator="implicitfast" gravity="{text_of(truth.gravity)}">'
         '<flag contact="disable"/></option><worldbody>'
     )
     for j, name in enumerate(truth.link_names):
@@ -55,16 +56,12 @@ def mjcf(truth: Truth, armature: Array) -> str:
         quat = pin.Quaternion(truth.R[j]).coeffs()[[3, 0, 1, 2]]
         order = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         head += (
-            f'<body name="{name}" pos="{_text(truth.p[j])}" quat="{_text(quat)}">'
-            f'<inertial pos="{_text(c)}" mass="{float(m)!r}" fullinertia="{_text(order)}"/>'
+            f'<body name="{name}" pos="{text_of(truth.p[j])}" quat="{text_of(quat)}">'
+            f'<inertial pos="{text_of(c)}" mass="{float(m)!r}" fullinertia="{text_of(order)}"/>'
             f'<joint name="{truth.joint_names[j]}" type="hinge" axis="0 0 1"'
             f' armature="{float(armature[j])!r}" frictionloss="1e-9" solreffriction="0.001 1"/>'
         )
     return head + "</body>" * truth.n + "</worldbody></mujoco>"
-
-
-def _text(values: Array) -> str:
-    return " ".join(repr(float(v)) for v in values)
 
 
 class Arm:

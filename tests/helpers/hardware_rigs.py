@@ -84,19 +84,14 @@ def fci_address(line: str) -> str:
     return next(word for word in line.split() if word.startswith("fci:"))
 
 
-def fci(protocol: int, allow_motion: bool):
+@contextmanager
+def fci(protocol: int, allow_motion: bool) -> Iterator[Start]:
     """The FCI server of one protocol, and drivers that may move it or not."""
-
-    @contextmanager
-    def start() -> Iterator[Start]:
-        options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
-        server = process(*SERVE, "fci", *options)
-        with server as line:
-            address = f"{fci_address(line)}?recover=1"
-            with one_at_a_time(lambda: FciArm(address, allow_motion=allow_motion)) as make:
-                yield make
-
-    return start
+    options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
+    with process(*SERVE, "fci", *options) as line:
+        address = f"{fci_address(line)}?recover=1"
+        with one_at_a_time(lambda: FciArm(address, allow_motion=allow_motion)) as make:
+            yield make
 
 
 @contextmanager
@@ -123,18 +118,14 @@ def can_line() -> Iterator[Start]:
         yield make
 
 
-def ros2(allow_motion: bool, *options: str):
+@contextmanager
+def ros2(allow_motion: bool) -> Iterator[Start]:
     """An arm behind ros2_control in a process of its own, on DDS over loopback."""
-
-    @contextmanager
-    def start() -> Iterator[Start]:
-        with (
-            ros2_arm(*options) as address,
-            one_at_a_time(lambda: Ros2Arm(address, PANDA_JOINTS, allow_motion)) as make,
-        ):
-            yield make
-
-    return start
+    with (
+        ros2_arm() as address,
+        one_at_a_time(lambda: Ros2Arm(address, PANDA_JOINTS, allow_motion)) as make,
+    ):
+        yield make
 
 
 @contextmanager

@@ -30,15 +30,11 @@ NOT_GIVEN = {
 WIRE = ("adapter sim ", "://")  # in commands for simulated hardware
 
 
-def _pages() -> dict[str, str]:
-    """Text of each page by its path from the root: first README and the tour, then by name."""
-    first = [ROOT / "README.md", ROOT / "docs" / "five-minutes.md"]
-    rest = sorted({*(ROOT / "docs").glob("*.md")} - {*first})
-    paths = [*first, *rest, ROOT / "drivers" / "README.md"]
-    return {path.relative_to(ROOT).as_posix(): path.read_text() for path in paths}
-
-
-PAGES = _pages()
+# Text of each page by its path from the root: first README and the tour, then by name.
+_first = [ROOT / "README.md", ROOT / "docs" / "five-minutes.md"]
+_rest = sorted({*(ROOT / "docs").glob("*.md")} - {*_first})
+_paths = [*_first, *_rest, ROOT / "drivers" / "README.md"]
+PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in _paths}
 
 
 def blocks(language: str, page: str | None = None) -> list[str]:

@@ -15,12 +15,14 @@ from adapter.physics.networks import FrameMotion
 from adapter.physics.rigid_arm import RigidArm
 from tests.helpers.arm_data import PIN_ORDER
 from tests.helpers.robot_models import (
+    MACHINES,
     ROBOTS,
     Case,
     pin_model,
     pinocchio_case,
     places_of,
     random_urdf,
+    read_quietly,
     relative,
     set_angles,
     urdf_text,
@@ -195,3 +197,23 @@ def test_at_rest_an_accelerometer_reads_the_reaction_to_gravity() -> None:
     up = base_at_rest(np.array([0.0, 0.0, -9.81]))[None]
     kernels.torques(r.frames, r.theta, JointMotion(q, 0 * q, 0 * q), up, tau)
     np.testing.assert_allclose(tau[0, :3], [0, 0, 9.81 * r.theta[:, 0].sum()], atol=1e-9)
+
+
+@pytest.mark.parametrize("robot", ["panda", "mixed17", *MACHINES])
+def test_momenta_agree_with_pinocchio(robot: str) -> None:
+    """With dM/dt = C + Cᵀ: dp/dt = tau - g + Cᵀ dq."""
+    rng = np.random.default_rng(len(robot))
+    model, arm = read_quietly(urdf_text(robot)), pin_model(urdf_text(robot))
+    data, names = arm.createData(), model.tree.joint_names
+    q, dq = rng.normal(size=(2, model.tree.n))
+    out = np.empty((3, model.tree.n))
+    kernels.momenta(frames_of(model.tree, model.lam), model.theta, q, dq, model.gravity, out)
+    at, places = pin.neutral(arm), places_of(arm, names)
+    set_angles(arm, at, names, q)
+    speed = np.zeros(arm.nv)
+    speed[places] = dq
+    coriolis = pin.computeCoriolisMatrix(arm, data, at, speed)
+    theirs = pin.crba(arm, data, at) @ speed, coriolis.T @ speed
+    theirs = *theirs, pin.computeGeneralizedGravity(arm, data, at)
+    for mine, other in zip(out, theirs, strict=True):
+        assert np.allclose(mine, other[places], atol=1e-8)

@@ -52,7 +52,9 @@ def _killed_in_motion(folder: Path) -> str:
             under_way = lambda: recording.exists() and recording.stat().st_size > 8e5  # noqa: E731
             wait_for(lambda: under_way() or loop.poll() is not None, 120)
             if loop.poll() is not None:
-                return _rightly_ended(loop.returncode, json.loads(figures.read_text()))
+                ended = json.loads(figures.read_text())  # rightly: states or commands were late
+                assert (loop.returncode, ended["ended"]) == (3, "driver_error") and ended["fault"]
+                return ended["fault"]
             assert under_way()
         finally:
             with suppress(ProcessLookupError):
@@ -63,12 +65,6 @@ def _killed_in_motion(folder: Path) -> str:
         time.sleep(0.5)
         assert np.abs(_at_rest(address) - q).max() < 1e-3
     return ""
-
-
-def _rightly_ended(code: int, figures: dict) -> str:
-    """The sentence of a run that the robot or its driver ended, as states or commands were late."""
-    assert (code, figures["ended"]) == (3, "driver_error") and figures["fault"]
-    return figures["fault"]
 
 
 def _at_rest(address: str) -> np.ndarray:

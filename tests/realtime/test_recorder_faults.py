@@ -87,16 +87,6 @@ def _stamps(path: Path) -> list[int]:
     return read_log(path).stamp_ns.tolist()
 
 
-def _check_full(result, path: Path) -> None:
-    assert len(result.troubles) == 1 and "nothing more is recorded" in result.troubles[0]
-    assert f"{path}: cannot be written" in result.troubles[0]
-    assert "what was recorded before stays readable" in result.troubles[0]
-    stamps = _stamps(path)
-    assert stamps == [1_000_000 * k for k in range(1, len(stamps) + 1)]
-    assert 0 < result.recorded <= len(stamps) and result.unrecorded > 0
-    assert result.restarts == 0 and not list(path.parent.glob("*.part2*"))
-
-
 @pytest.fixture
 def small_disk(tmp_path):
     """A folder on a disk of `ROOM` bytes, where this user may have one; None elsewhere."""
@@ -130,7 +120,13 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
     path = (small_disk or tmp_path) / "a.mcap"
     result = _run(path, None if small_disk else _little_room)
     assert small_disk is None or "No space left on device" in result.troubles[0]
-    _check_full(result, path)
+    assert len(result.troubles) == 1 and "nothing more is recorded" in result.troubles[0]
+    assert f"{path}: cannot be written" in result.troubles[0]
+    assert "what was recorded before stays readable" in result.troubles[0]
+    stamps = _stamps(path)
+    assert stamps == [1_000_000 * k for k in range(1, len(stamps) + 1)]
+    assert 0 < result.recorded <= len(stamps) and result.unrecorded > 0
+    assert result.restarts == 0 and not list(path.parent.glob("*.part2*"))
     assert path.stat().st_size <= ROOM
 
 
@@ -181,13 +177,9 @@ def test_a_slow_disk_costs_what_the_ring_cannot_hold(tmp_path, hangs_s, ring_s):
     assert (result.unrecorded == 0) == (ring_s > hangs_s)
 
 
-def _die_once(path: Path) -> None:
-    _in_the_middle(path, partial(tools.die_once, "recorder"))
-
-
 def test_a_killed_recorder_is_followed_by_one_with_a_file_of_its_own(tmp_path):
     path = tmp_path / "a.mcap"
-    result = _run(path, _die_once)
+    result = _run(path, partial(_in_the_middle, act=partial(tools.die_once, "recorder")))
     assert result.restarts == 1 and result.unrecorded == 0
     assert len(result.troubles) == 1 and "exit code -9" in result.troubles[0]
     first, second = _stamps(path), _stamps(tmp_path / "a.part2.mcap")

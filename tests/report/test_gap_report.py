@@ -158,9 +158,11 @@ def test_signatures_are_of_the_worst_joints() -> None:
     assert shown_joints(result_of("problem")) == []
 
 
-def test_a_problem_with_curves_still_has_a_page() -> None:
+def test_a_problem_with_curves_and_corrections_without_prior_have_a_page() -> None:
     result = replace(result_of("problem"), curves=(made_up.curves(),))
     assert "Against velocity" in render_gap_page(result)
+    result = replace(result_of("one_finding"), corrections_prior=np.zeros((7, 10)))
+    assert 'id="correction"' not in render_gap_page(result)
 
 
 def test_unknown_rollouts_are_dashes_or_left_out(pages: dict[str, str]) -> None:
@@ -170,11 +172,6 @@ def test_unknown_rollouts_are_dashes_or_left_out(pages: dict[str, str]) -> None:
     text = text_of(render_gap_page(replace(one, after=failed)))
     assert "80.0 – " in text
     assert "80 → – mrad" in text
-
-
-def test_a_correction_without_prior_is_no_division() -> None:
-    result = replace(result_of("one_finding"), corrections_prior=np.zeros((7, 10)))
-    assert 'id="correction"' not in render_gap_page(result)
 
 
 def test_every_effect_has_its_phrase() -> None:

@@ -253,14 +253,14 @@ def test_settings_are_checked(name: str, value: float) -> None:
         FrontEndSettings(**{name: value})
 
 
-def test_a_sample_of_another_arm_is_named() -> None:
-    front_end, two = FrontEnd(panda_model()), np.zeros(2)
-    with pytest.raises(DriverError, match=r"has 2 positions, 2 velocities and 2 torques.*7 joints"):
-        front_end.step(JointSample(1, two, two, two))
-
-
-@pytest.mark.parametrize("stamp", [1.5, np.float64(2e9)])
-def test_a_stamp_in_seconds_is_named(stamp: float) -> None:
-    front_end, seven = FrontEnd(panda_model()), np.zeros(N)
-    with pytest.raises(DriverError, match=r"stamp_ns .* counts whole nanoseconds"):
-        front_end.step(JointSample(stamp, seven, seven, seven))  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("stamp", "n", "said"),
+    [
+        (1, 2, r"has 2 positions, 2 velocities and 2 torques.*7 joints"),
+        (1.5, N, r"stamp_ns .* counts whole nanoseconds"),
+        (np.float64(2e9), N, r"stamp_ns .* counts whole nanoseconds"),
+    ],
+)
+def test_a_sample_of_another_arm_or_in_seconds_is_named(stamp, n: int, said: str) -> None:
+    with pytest.raises(DriverError, match=said):
+        FrontEnd(panda_model()).step(JointSample(stamp, *np.zeros((3, n))))

@@ -51,7 +51,6 @@ from tests.helpers.board_tools import (
 from tests.helpers.hardware_rigs import SERVE
 
 READY = build("nominal").truth.ready
-LIMP = BoardOptions(stand=False)
 GROUP = "239.74.163.2"
 IPV6_GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
 
@@ -282,7 +281,7 @@ def test_payload_comes_with_the_time_since_the_first_frame() -> None:
 def test_a_backlog_is_caught_up_to_a_limit_and_the_rest_slips() -> None:
     clock = [0]
     bus = can.Bus(interface="virtual", channel="slip")
-    boards = Boards(bus, build("nominal"), LIMP, now_ns=lambda: clock[0])
+    boards = Boards(bus, build("nominal"), BoardOptions(stand=False), now_ns=lambda: clock[0])
     try:
         boards.service()
         for later_ms, ticks, slipped_ms in ((50, 51, 0), (1050, 151, 900), (1051, 152, 900)):

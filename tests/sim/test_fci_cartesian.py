@@ -23,16 +23,12 @@ PREFIX = "cartesian_motion_generator_"
 TICKS = 600  # of an eased motion
 
 
-@pytest.fixture(params=["nominal", "real_drives"])
-def robot(request):
-    made = Robot(build(request.param, 1), 5)
-    yield made
-    made.arm.plant.close()
+both = pytest.mark.parametrize("robot", ["nominal", "real_drives"], indirect=True)
 
 
 @pytest.fixture
-def still():
-    made = Robot(build("nominal", 1), 5)
+def robot(request):
+    made = Robot(build(getattr(request, "param", "nominal"), 1), 5)
     yield made
     made.arm.plant.close()
 
@@ -56,6 +52,7 @@ def shifted(start, s):
     return pose
 
 
+@both
 @pytest.mark.parametrize("controller", [0, 1])
 def test_poses_are_followed(robot, controller):
     start = robot.arm.pose.copy()
@@ -70,6 +67,7 @@ def test_poses_are_followed(robot, controller):
     assert not robot.violations
 
 
+@both
 def test_twists_are_followed_and_the_elbow_goes_where_it_is_told(robot):
     start, elbow = robot.arm.pose.copy(), robot.arm.q[2]
     robot.request(move(0, 3))
@@ -85,17 +83,6 @@ def test_twists_are_followed_and_the_elbow_goes_where_it_is_told(robot):
     assert not robot.violations
 
 
-def bent(start, what):
-    """A pose with something wrong from the 50th tick on."""
-
-    def at(k):
-        pose, late = start.copy(), max(k - 50, 0)
-        pose[0, 3] += what(late)
-        return pose
-
-    return at
-
-
 @pytest.mark.parametrize(
     ("what", "error"),
     [
@@ -106,14 +93,16 @@ def bent(start, what):
         (lambda late: 5e-4 * (late - 100 * np.tanh(late / 100)), "joint_"),  # too far
     ],
 )
-def test_poses_that_break_a_limit(still, what, error):
-    at = bent(still.arm.pose.copy(), what)
-    still.request(move(0, 2))
+def test_poses_that_break_a_limit(robot, what, error):
+    start = robot.arm.pose.copy()
+    robot.request(move(0, 2))
     for k in range(3000):
-        still.tick(answer(at(k)))
-        if still.motion is None:
+        pose = start.copy()  # with something wrong from the 50th tick on
+        pose[0, 3] += what(max(k - 50, 0))
+        robot.tick(answer(pose))
+        if robot.motion is None:
             break
-    assert len(still.violations) == 1 and error in still.violations[0]
+    assert len(robot.violations) == 1 and error in robot.violations[0]
 
 
 @pytest.mark.parametrize(
@@ -124,13 +113,13 @@ def test_poses_that_break_a_limit(still, what, error):
         (1.0, 1, None),
     ],
 )
-def test_joints_that_a_hand_within_its_limits_would_jerk(still, acceleration, ticks, error):
-    still.request(move(0, 3))
+def test_joints_that_a_hand_within_its_limits_would_jerk(robot, acceleration, ticks, error):
+    robot.request(move(0, 3))
     rate = 0.0
     for k in range(40):
         rate += 1e-3 * acceleration * min((k + 1) / ticks, 1.0)
-        still.tick(answer(twist=np.array([0.0, 0.0, rate, 0.0, 0.0, 0.0])))
-    assert still.violations == ([] if error is None else [error])
+        robot.tick(answer(twist=np.array([0.0, 0.0, rate, 0.0, 0.0, 0.0])))
+    assert robot.violations == ([] if error is None else [error])
 
 
 def test_an_fr3_slows_down_towards_the_end_of_a_joint():
@@ -157,10 +146,10 @@ def test_an_fr3_slows_down_towards_the_end_of_a_joint():
         ((np.nan, -1.0), PREFIX + "start_elbow_invalid"),
     ],
 )
-def test_elbows_that_are_none(still, elbow, error):
-    still.request(move(0, 2))
-    still.tick(answer(still.arm.pose, elbow=np.array(elbow)))
-    assert still.violations == [error]
+def test_elbows_that_are_none(robot, elbow, error):
+    robot.request(move(0, 2))
+    robot.tick(answer(robot.arm.pose, elbow=np.array(elbow)))
+    assert robot.violations == [error]
 
 
 @pytest.mark.parametrize("stiffness", [300.0, 1500.0])

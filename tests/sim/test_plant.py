@@ -23,13 +23,8 @@ from tests.helpers.random_trees import random_tree
 from tests.helpers.robot_models import frame_motion
 
 
-def oracle_motion(truth, q, dq, ddq):
-    """(n, 6) each: [v; w] and [a - g; dw] of the links of a serial arm, in their own axes."""
-    model = pin_model(truth)
-    return motion_of(model, q, dq, ddq, range(1, truth.n + 1))
-
-
 def motion_of(model, q, dq, ddq, joints):
+    """(n, 6) each: [v; w] and [a - g; dw] of the links behind joints, in their own axes."""
     data, g = model.createData(), model.gravity.linear
     pin.forwardKinematics(model, data, q, dq, ddq)
     rows = np.array([frame_motion(model, data, j, np.eye(3), g).ravel() for j in joints])
@@ -97,7 +92,6 @@ def test_a_wrench_is_found_from_its_torques_unless_the_posture_is_singular():
 
 
 T_S = 1e-3
-MOTION_S = 2.0
 
 
 def reference(t, q0, speed=1.0):
@@ -107,7 +101,7 @@ def reference(t, q0, speed=1.0):
     return q0 + a * (1 - np.cos(w * t)), a * w * np.sin(w * t), a * w * w * np.cos(w * t)
 
 
-def drive(plant, seconds=MOTION_S, payload=None):
+def drive(plant, seconds=2.0, payload=None):
     """Computed-torque motion; clean samples as arrays t, q, dq, tau and the list of samples."""
     model = pin_model(plant.truth)
     data, samples = model.createData(), []
@@ -160,10 +154,10 @@ def test_own_acceleration_is_that_of_the_oracle():
 
 def test_link_motion_is_that_of_the_samples_own_instant():
     plant = build("bent_link", 1, noise="none").plant()
-    (q, dq, _), samples = drive(plant, 0.5)
+    model, ((q, dq, _), samples) = pin_model(plant.truth), drive(plant, 0.5)
     ddq = (dq[2:] - dq[:-2]) / (2 * T_S)
     for k in range(60, 480, 40):
-        twist, accel = oracle_motion(plant.truth, q[k], dq[k], ddq[k - 1])
+        twist, accel = motion_of(model, q[k], dq[k], ddq[k - 1], range(1, 8))
         assert samples[k].links.twist == pytest.approx(twist, abs=1e-9)
         assert samples[k].links.accel == pytest.approx(accel, abs=1e-3 * 9.81)
 

@@ -73,31 +73,21 @@ class RobotFacts:
     speed_by_position: SpeedByPosition | None
     model: SelfModel
 
-    def has_the_body_of(self, model: SelfModel) -> bool:
-        """Whether a model has the same joints; where its base stands does not matter."""
-        own = self.model
-        if model.tree.floating or model.tree.parent != own.tree.parent:
-            return False
-        turns = matrix_from_zxz(own.lam[1:, :3]) - matrix_from_zxz(model.lam[1:, :3])
-        places = own.lam[1:, 3:] - model.lam[1:, 3:]
-        return bool(np.abs(turns).max() < SAME_TURN and np.abs(places).max() < SAME_PLACE_M)
-
-
-@cache
-def known_robots() -> tuple[RobotFacts, ...]:
-    """All arms that are known by name."""
-    return tuple(_read(path.stem) for path in sorted(FOLDER.glob("*.toml")))
-
 
 def facts_of(model: SelfModel) -> RobotFacts | None:
     """The known arm that a model describes, by its joints and their limits, or else its name."""
-    same = [robot for robot in known_robots() if robot.has_the_body_of(model)]
-    its, limited = model.limits, []
-    for robot in same:
-        own = robot.model.limits
-        apart = np.abs([own.lower - its.lower, own.upper - its.upper])
-        limited += [robot] if (apart < 0.02).all() else []  # rad
-    named = [robot for robot in same if model.name.lower().startswith(robot.names)]
+    its, limited, named = model.limits, list[RobotFacts](), list[RobotFacts]()
+    for robot in [_read(path.stem) for path in sorted(FOLDER.glob("*.toml"))]:
+        own, limits = robot.model, robot.model.limits
+        if model.tree.floating or model.tree.parent != own.tree.parent:
+            continue
+        # where its base stands does not matter
+        turns = matrix_from_zxz(own.lam[1:, :3]) - matrix_from_zxz(model.lam[1:, :3])
+        places = own.lam[1:, 3:] - model.lam[1:, 3:]
+        if np.abs(turns).max() < SAME_TURN and np.abs(places).max() < SAME_PLACE_M:
+            apart = np.abs([limits.lower - its.lower, limits.upper - its.upper])
+            limited += [robot] if (apart < 0.02).all() else []  # rad
+            named += [robot] if model.name.lower().startswith(robot.names) else []
     return next(iter(limited or named), None)
 
 
@@ -107,6 +97,7 @@ def _table(name: str) -> dict[str, Any]:
     return table if like is None else _table(like) | table
 
 
+@cache
 def _read(name: str) -> RobotFacts:
     table = _table(name)
     names, capsules = tuple(table.pop("names")), table.pop("capsules")
