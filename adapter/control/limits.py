@@ -62,7 +62,7 @@ class MotionLimits:
             UNKNOWN_ACCELERATION * modest if known is None else known.acceleration,
             UNKNOWN_JERK * modest if known is None else known.jerk,
             np.where(np.isfinite(limits.effort), limits.effort, np.inf),
-            np.full(n, 1000.0) if known is None else known.torque_rate,
+            np.full(n, 1000.0) if known is None else known.torque_rate,  # N m/s
             known,
             model.tree.joint_names,
             model.tree.slides,

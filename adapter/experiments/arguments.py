@@ -59,12 +59,12 @@ def _check_experiment(args: argparse.Namespace) -> None:
 def bench(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `bench`."""
     parser.description = (
-        "Times one update of λ and θ of a Panda beside autograd through the torch "
-        "networks, Pinocchio's regressor with recursive least squares (if pin is installed) and "
-        "differentiable-robot-model (extra [peers], if installed). With --log it compares ways to "
-        "learn that arm instead, each told the documented model and the recording and run in a "
-        "process of its own: adapter gap and replay, least squares, and, where extra [peers] is "
-        "installed, figaroh, mujoco.sysid and CMA-ES: unseen torque, rollouts, time, memory."
+        "Times one update of λ and θ of a Panda beside autograd through the torch networks and "
+        "Pinocchio's regressor with recursive least squares (if pin is installed). With --log it "
+        "compares ways to learn that arm instead, each told the documented model and the recording "
+        "and run in a process of its own: adapter gap and replay, least squares, and, where extra "
+        "[peers] is installed, figaroh, mujoco.sysid and CMA-ES: unseen torque, rollouts, time, "
+        "memory."
     )
     add = parser.add_argument
     add("--repeats", type=int, default=2000, metavar="N", help="default 2000")

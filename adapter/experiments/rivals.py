@@ -204,9 +204,6 @@ def figaroh(given: Given) -> Learned:
     return Learned(with_effects(model, theta, effects))
 
 
-# --- MuJoCo's own, and evolution in MuJoCo -------------------------------------------------------
-
-
 def spec_of(model: SelfModel) -> Any:
     """The arm for MuJoCo: a motor and sensors of position and speed in every joint, 1 ms steps."""
     import mujoco
@@ -369,7 +366,7 @@ def evolution(given: Given) -> Learned:
         search.tell(tried, [cost(x) for x in tried])
     *values, bias = decoded(search.result.xbest)
     found = {**dict(zip(FIELDS, values, strict=True)), "encoder_offset": bias}
-    ended = ", ".join(search.stop()) or "nothing"
+    ended = ", ".join(search.stop())
     said = f"{4 * n} numbers, {search.result.evaluations} candidates; ended by {ended}"
     return Learned(with_effects(model, RigidArm.of(model).theta, found), [said])
 

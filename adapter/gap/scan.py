@@ -194,12 +194,10 @@ class SignatureTable:
 
     def honest(self, lead: Lead) -> Lead:
         """A lead under the noise that it leaves itself, in place of that of the richest model."""
-        if lead.interval_s != WHOLE:
-            lead = self.dated(lead)
+        lead = self.dated(lead)
         found = self.together([lead])
-        return replace(
-            lead, log_evidence=found.log_evidence + lead.odds, chi2=found.chi2, x=found.x
-        )
+        nats = found.log_evidence + lead.odds
+        return replace(lead, log_evidence=nats, chi2=found.chi2, x=found.x)
 
     def dated(self, lead: Lead) -> Lead:
         """A lead with the dates that its evidence likes best, to a sample of the band."""

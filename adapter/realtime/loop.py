@@ -218,7 +218,7 @@ def _prepare(
 
     sample = session.get_ready(prepare)
     shown = copy.deepcopy(front_end)  # some motion around this sample, so that all is compiled
-    for k in range(1, 500):
+    for k in range(1, 500):  # ticks of made-up motion
         angle = WARM_UP_RATE * 1e-9 * driver.period_ns * k
         q = sample.q + WARM_UP_REACH * np.sin(angle)
         dq = np.full(q.shape, WARM_UP_REACH * WARM_UP_RATE * np.cos(angle))
@@ -266,7 +266,7 @@ class _Loop:
             ticks += 1
             if stop.count:
                 session.begin_stop(Ended.INTERRUPTED)
-            if ticks % 256 == 0:
+            if ticks % 256 == 0:  # a look at the workers takes its time
                 self._supervisor.look_after()
                 if self._supervisor.loop_board is not None:
                     missed = self._clock.missed, self._clock.missed_own

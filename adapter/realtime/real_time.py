@@ -39,7 +39,8 @@ class RealTime:
         self.grants: list[str] = []
 
     def __enter__(self) -> RealTime:
-        for answer in (quiet_collector(), lock_memory(), pin({self._core}), request_fifo(70)):
+        fifo = request_fifo(70)  # above the kernel's interrupt threads (50), below watchdogs (99)
+        for answer in (quiet_collector(), lock_memory(), pin({self._core}), fifo):
             line, undo = answer
             self.grants.append(line)
             if undo is not None:

@@ -72,6 +72,7 @@ class Session:
         self.fault: str | None = None
         self.began_ns = self.had_ns = self.stepped_ns = 0
         self.stopped = False
+        # ns; a longer step of the stamps is a clock that was set
         self._elapsed_ns, self._clock = 0, SampleClock(driver.period_ns, 1_000_000_000)
         self._stopping_at_s: float | None = None
         self._ready_sample: JointSample | None = None
@@ -90,7 +91,7 @@ class Session:
             DriverError: as the driver says.
         """
         driver = self._driver
-        for left in reversed(range(200)):
+        for left in reversed(range(200)):  # one of these can be started from
             sample = driver.read()
             try:
                 prepare(sample)

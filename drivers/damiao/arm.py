@@ -295,13 +295,8 @@ class DamiaoArm:
             self._speed.add(stamp_ns, q, dq)
             if self._driving:
                 # what the arm must be carried with, here and with the guardian
-                self._carried = (
-                    self._told
-                    or [  # a mean over 50 ms
-                        old + 0.02 * (new - old)
-                        for old, new in zip(self._carried, values[2 * n :], strict=True)
-                    ]
-                )
+                pairs = zip(self._carried, values[2 * n :], strict=True)  # a mean over 50 ms
+                self._carried = self._told or [old + 0.02 * (new - old) for old, new in pairs]
                 if self._guardian is not None:
                     parts = values[:n], values[n : 2 * n], self._carried, values[2 * n :]
                     self._guardian.memory.put(*parts)

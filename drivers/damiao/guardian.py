@@ -47,6 +47,7 @@ from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
 from drivers.process import Block
 
+MOST_JOINTS = 15  # ids of four bits, without the service's
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
 READY = "ready"
@@ -80,7 +81,7 @@ class GuardianMemory(Block):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("mode", "beat_ns", "taken", "_pushed")),
         *((name, ctypes.c_double) for name in ("_torque", "_limit")),
-        *((name, ctypes.c_double * 15) for name in ("held", "q", "dq", "carried", "tau")),
+        *((name, ctypes.c_double * MOST_JOINTS) for name in ("held", "q", "dq", "carried", "tau")),
     )
 
     @property
@@ -175,7 +176,7 @@ class Guardian:
                 return
             self._listen()
             self._send(self._braker.commands(HOLD_S, self._q, self._dq))
-            if time.monotonic() - self._heard_s > 10.0:
+            if time.monotonic() - self._heard_s > 10.0:  # s
                 self._say("no motor answers any more; nothing is left to hold")
                 return
             time.sleep(HOLD_S)
@@ -195,6 +196,7 @@ class Guardian:
             self._gone_on = 0
         elif beat_ns != before_ns and memory.forbidden is not None:
             self._gone_on += 1
+            # one command may have been under way when driving was forbidden
             if self._gone_on >= 2 and os.getppid() == self._parent:
                 self._say(f"process {self._parent} goes on driving; it is ended")
                 os.kill(self._parent, signal.SIGKILL)

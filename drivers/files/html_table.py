@@ -14,10 +14,7 @@ def html_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) 
     >>> html_table("a < b", ["joint"], [["1"]])
     '<p><b>a &lt; b</b></p><table><tr><th>joint</th></tr><tr><td>1</td></tr></table>'
     """
-    lines = [_row("th", heads), *(_row("td", row) for row in rows)]
-    table = f"<table>{''.join(lines)}</table>" if rows else ""
-    return f"<p><b>{escape(title)}</b></p>{table}"
-
-
-def _row(kind: str, cells: Sequence[str]) -> str:
-    return f"<tr>{''.join(f'<{kind}>{escape(cell)}</{kind}>' for cell in cells)}</tr>"
+    kinds = zip(("th", *("td" for _ in rows)), (heads, *rows), strict=True)
+    lines = ("".join(f"<{kind}>{escape(x)}</{kind}>" for x in cells) for kind, cells in kinds)
+    table = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<p><b>{escape(title)}</b></p>" + (f"<table>{table}</table>" if rows else "")

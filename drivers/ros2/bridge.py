@@ -172,7 +172,7 @@ class Bridge:
         stamps = [np.frombuffer(data, "<i4", 2, 4).tolist() for data in first]
         steps = np.diff([sec + 1e-9 * nanosec for sec, nanosec in stamps])
         hz = 1.0 / max(float(np.median(steps)), 1e-9)
-        if abs(hz / where.hz - 1.0) > 0.1:
+        if abs(hz / where.hz - 1.0) > 0.1:  # of the rate that was told
             raise DriverError(
                 f"{where.states} comes at {hz:.0f} Hz, not {where.hz:.0f}; say hz={hz:.0f} in the "
                 "address"

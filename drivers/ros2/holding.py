@@ -54,7 +54,7 @@ class Braker:
 
     def listen(self, dq: Array, tau: Array) -> None:
         """Speeds and torques (n,) measured; while somebody else drives, too."""
-        now, share = np.stack([dq, tau]), min(self._period_s / 0.02, 1.0)
+        now, share = np.stack([dq, tau]), min(self._period_s / 0.02, 1.0)  # a mean over 20 ms
         self._mean = now if self._mean is None else self._mean + share * (now - self._mean)
 
     def blind(self) -> Array:
@@ -74,6 +74,7 @@ class Braker:
         speed = max(1.0 - self._braked_s / BRAKE_S, 0.0) * self._speed
         self._goal = self._goal + speed * self._period_s
         self._look_whether_it_stands(q, dq)
+        # at rest the spring has a share of the largest torque
         away, most = self._goal - q, (0.15 if self.standing else 1.0) * self.effort
         self._integral = np.clip(
             self._integral + INTEGRAL_RATE * self._kp * away * self._period_s, -most, most

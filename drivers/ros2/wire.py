@@ -87,7 +87,7 @@ class Network:
         found = []
         for end in self._seen[which].read(MOST_ENDS):
             name, schema = ros_topic(end.topic_name), ros_schema(end.type_name)
-            if name and end.sample_info.instance_state == 16:
+            if name and end.sample_info.instance_state == 16:  # alive, see `InstanceState`
                 found.append(Found(name, schema, str(end.key)))
         return found
 

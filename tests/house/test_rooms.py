@@ -27,7 +27,7 @@ LOOSE = {"__init__.py", "__main__.py", "errors.py", "optional.py", "shadowed.py"
 # What takes long to load, or is not there everywhere: the only thing a function may import.
 HEAVY = {
     *("torch", "numba", "pybullet", "matplotlib", "scipy", "filterpy", "clarabel", "sklearn"),
-    *("pinocchio", "coal", "mujoco", "can", "differentiable_robot_model", "figaroh", "cma"),
+    *("pinocchio", "coal", "mujoco", "can", "figaroh", "cma"),
     *("rich", "importlib.metadata", "foxglove", "cyclonedds", "jinja2"),
 }
 FACES = {

@@ -36,7 +36,7 @@ def sample_log(
         of the stretches.
     """
     file = Path(path)
-    if not file.is_file() or file.stat().st_size < 2**26:
+    if not file.is_file() or file.stat().st_size < 2**26:  # bytes; read whole
         return None
     try:
         scan = _Part(file)
