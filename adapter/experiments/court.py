@@ -31,6 +31,7 @@ from adapter.gap.held_out import lasting, rms, torque_errors
 from adapter.gap.signals import MEASURED, ROLLOUT_STEP_S, Recorded
 from adapter.learning.batch.theta_filling import possible_theta
 from adapter.model.inertia import is_consistent
+from adapter.model.numbers import plain
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -222,11 +223,9 @@ def in_a_process(way: str, given: Given, limit_s: float) -> tuple[Learned, dict[
         path.write_bytes(pickle.dumps((way, given)))
         child = "import sys, adapter.experiments.rivals as ways; ways.main(sys.argv[1])"
         command = [sys.executable, "-c", child, os.fspath(path)]
-        alone = {**os.environ, "OMP_NUM_THREADS": "1"}
+        env = {**os.environ, "OMP_NUM_THREADS": "1"}
         try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, timeout=limit_s, env=alone
-            )
+            done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s, env=env)
         except subprocess.TimeoutExpired:
             return f"not done after {limit_s:g} s (--limit)"
         if done.returncode:
@@ -240,22 +239,22 @@ def in_a_process(way: str, given: Given, limit_s: float) -> tuple[Learned, dict[
 
 
 def first(verdicts: Sequence[Verdict]) -> str:
-    """Where ours is first, and who is where it is not."""
+    """Which way is first in what."""
     ran = [v for v in verdicts if v.ran]
     if not any(v.way == OURS for v in ran) or len(ran) < 2:
         return "there is nothing to compare"
     said = []
     for what, key, heads in (
-        ("unseen torque of joint", "torque_nm", range(1, len(ran[0].torque_nm) + 1)),
-        ("joints in rollouts of s", "off_rad", HORIZONS_S),
-        ("the hand in those of s", "off_m", HORIZONS_S),
+        ("Least unseen torque, by joint", "torque_nm", range(1, len(ran[0].torque_nm) + 1)),
+        ("Joints nearest in rollouts, by s", "off_rad", HORIZONS_S),
+        ("The hand nearest in them, by s", "off_m", HORIZONS_S),
     ):
         table = np.array([getattr(v, key) for v in ran])
         told = np.flatnonzero(np.isfinite(table).any(axis=0))
-        best = [ran[k].way for k in np.nanargmin(table[:, told], axis=0)]
-        names = [f"{heads[k]:g} ({x})" for k, x in zip(told, best, strict=True) if x != OURS]
-        held = f"{OURS} is first on {best.count(OURS)} of {len(best)}"
-        said.append(f"{what}: {held}" + (f"; not on {', '.join(names)}" if names else ""))
+        where: dict[str, list[str]] = {}
+        for k, best in zip(told, np.nanargmin(table[:, told], axis=0), strict=True):
+            where.setdefault(ran[best].way, []).append(f"{heads[k]:g}")
+        said.append(f"{what}: " + "; ".join(f"{x} {', '.join(at)}" for x, at in where.items()))
     return ". ".join(said)
 
 
@@ -264,16 +263,16 @@ def tables(verdicts: Sequence[Verdict]) -> list[Table]:
     ran = [v for v in verdicts if v.ran]
     torque = [[v.way, *(f"{x:.3f}" for x in v.torque_nm)] for v in ran]
     pairs = ((v, zip(1e3 * v.off_rad, 1e3 * v.off_m, strict=True)) for v in ran)
-    rolled = [[v.way, *(f"{a:.3g}; {b:.3g}" for a, b in x)] for v, x in pairs]
+    rolled = [[v.way, *("; ".join(map(plain, x)) for x in both)] for v, both in pairs]
     heads = [f"{s:g} s" for s in HORIZONS_S]
-    joints = [str(j + 1) for j in range(max((len(v.torque_nm) for v in ran), default=0))]
+    joints = [f"joint {j + 1}" for j in range(max((len(v.torque_nm) for v in ran), default=0))]
     cost = [[v.way, f"{v.cpu_s:.1f}", f"{v.peak_mb:.0f}"] for v in ran]
-    said = [[v.way, ", ".join(v.names), "; ".join(v.notes)] for v in verdicts]
+    said = [[v.way, "; ".join(filter(None, [", ".join(v.names), *v.notes]))] for v in verdicts]
     return [
-        Table(["Left of unseen torque, N m rms", *joints], torque),
+        Table(["Unseen torque left, N m rms", *joints], torque),
         Table(["Rollouts off, mrad; hand, mm", *heads], rolled),
         Table(["Cost", "processor, s", "memory, MB"], cost),
-        Table(["What it says", "names", "notes"], said),
+        Table(["Way", "what it names, and says"], said),
     ]
 
 
