@@ -135,9 +135,9 @@ COMMANDS = {  # in the order of --help
     ),
     "bench": Command(
         experiments.bench,
-        "time the update beside its rivals",
+        "compare an update, or learning from a log, with rivals",
         "adapter.experiments.benchmark:run",
-        begins="timing the update beside its rivals",
+        begins="comparing with rivals",
     ),
     "completion": Command(completion.declare, "what a shell needs to complete command lines"),
 }
