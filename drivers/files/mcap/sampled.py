@@ -18,6 +18,7 @@ from drivers.files.mcap.records import HEAD, RECORD, McapScan, Region
 from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
 
+SAMPLED_FROM = 2**26  # bytes; a smaller file is read whole
 _INDEXED = {Opcode.METADATA_INDEX: Opcode.METADATA, Opcode.ATTACHMENT_INDEX: Opcode.ATTACHMENT}
 STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacked, about
 
@@ -36,7 +37,7 @@ def sample_log(
         of the stretches.
     """
     file = Path(path)
-    if not file.is_file() or file.stat().st_size < 2**26:  # bytes; read whole
+    if not file.is_file() or file.stat().st_size < SAMPLED_FROM:
         return None
     try:
         scan = _Part(file)
