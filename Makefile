@@ -80,6 +80,7 @@ trials: $(WARM)
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/simulate_trials.py --json runs/simulate_trials.json
 	PYTHONPATH=. $(BIN)/python tests/benchmarks/live_trials.py
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/twin_trials.py --json runs/twin_trials.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/door_trials.py --json runs/door_trials.json
 	PYTHONPATH=. $(BIN)/python tests/benchmarks/law_trials.py --json runs/law_trials.json
 	test ! -d ../shared || PYTHONPATH=. $(BIN)/python tests/benchmarks/odd_trials.py hidden --first 31000 --json runs/odd_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/contact_trials.py --json runs/contact_trials.json
