@@ -52,8 +52,9 @@ class MujocoArm(SimulatedArm):
         self._qpos, self._dofs = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
         lost = dict.fromkeys(("dof_damping", "dof_dampingpoly", "dof_frictionloss"), self._dofs)
         lost |= dict.fromkeys(("jnt_stiffness", "jnt_stiffnesspoly"), joints)
-        for name in lost.keys() & set(dir(self.model)):  # polynomials are MuJoCo 4's
-            getattr(self.model, name)[lost[name]] = 0.0
+        for name, where in lost.items():
+            if hasattr(self.model, name):  # polynomials are MuJoCo 4's
+                getattr(self.model, name)[where] = 0.0
         self.model.dof_armature[self._dofs] = self.effects.held(ARMATURE)
         self._mujoco.mj_setConst(self.model, self._mujoco.MjData(self.model))
 

@@ -36,11 +36,10 @@ MASS = "mass", -1
 
 def run(seed: int) -> Row:
     """One twin: pairs of doors, and doors and the truth: (what, joint, how far apart)."""
-    twin = draw_twin(seed)
-    made = (by_mujoco if seed % 2 else by_pinocchio)(twin)
+    twin, make = draw_twin(seed), by_mujoco if seed % 2 else by_pinocchio
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        path, file, _ = write_files(made, nominal_urdf(twin.nominal), {}, folder)
+        path, file, _ = write_files(make(twin), nominal_urdf(twin.nominal), {}, folder)
         log, model, out = read_log(path), read_robot(str(file)), folder / "gap.json"
         load, own = find_load(log, model), fitted_to(log, PipelineSettings().filter)[0]
         settings = PipelineSettings(filter=own, learner=LearnerSettings(effects=REAL_ARM_EFFECTS))

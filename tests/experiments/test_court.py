@@ -14,6 +14,7 @@ from adapter.cli.main import main
 from adapter.effects.robots import documented
 from adapter.experiments import court
 from adapter.experiments.rivals import WAYS, Given, Learned, Way, rigid, sysid
+from adapter.physics.rigid_arm import RigidArm
 from tests.helpers.gap_tools import pinocchio_recording, with_sines
 from tests.hidden import draw, write
 
@@ -77,13 +78,13 @@ def test_rollouts_of_the_truth_follow_it() -> None:
     assert 0.3e-6 < moved < 0.9e-6  # the elbow is some 0.6 m from the hand
 
 
-@pytest.mark.skipif(importlib.util.find_spec("absl") is None, reason="mujoco[sysid] is not there")
 def test_sysid_finds_friction() -> None:
-    model = rigid(documented("panda"))
-    t = 1e-3 * np.arange(1000)[:, None]
-    q, dq = 0.1 * np.sin(3.0 * t) - 0.5 * np.ones(7), 0.3 * np.cos(3.0 * t) * np.ones(7)
-    _, (before, after) = sysid(model, [(q, dq, 0.0 * q)], {"viscous_friction": [0]}, 2)
-    assert after <= before
+    model, wave = rigid(documented("panda")), 3e-3 * np.arange(1000)[:, None] * np.ones(7)
+    q, dq, ddq = 0.1 * np.sin(wave) - 0.5, 0.3 * np.cos(wave), -0.9 * np.sin(wave)
+    tau = RigidArm.of(model).torque(q, dq, ddq) + 2.0 * dq * np.eye(7)[0]  # N m s/rad
+    found, (before, after) = sysid(model, [(q, dq, tau)], {"viscous_friction": [0]}, 5)
+    assert after < 0.1 * before
+    assert found.effects[0]["parameters"]["Fv"][0] == pytest.approx(2.0, rel=0.02)
 
 
 def test_what_cannot_be_is_refused_in_a_sentence(
