@@ -15,11 +15,9 @@ from collections import deque
 from typing import NamedTuple
 
 from drivers.fci import reader
-from drivers.fci.reader import HEAD, READY, RECORD, SLOTS, TAIL, WORD
+from drivers.fci.reader import HEAD, READY, RECORD, SLOTS, TAIL, words_of
 from drivers.interface import DriverError
 
-# A reader that wakes up asks for the interpreter lock and waits this long before the running
-# thread is told to give it up. Python's default of 5 ms is five ticks of the robot.
 RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
 _SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
 RESTARTS, RESTARTS_WITHIN_S = 5, 10.0
@@ -37,6 +35,7 @@ class QuickSwitching:
         with self._lock:
             if self._users == 0:
                 self._before_s = sys.getswitchinterval()
+                # A thread that wakes up waits this long for the lock; by default five ticks.
                 sys.setswitchinterval(min(self._before_s, 50e-6))
             self._users += 1
 
@@ -128,7 +127,7 @@ class ReaderClient:
         self._memory = os.memfd_create("fci-states")
         os.ftruncate(self._memory, size)
         self._map = mmap.mmap(self._memory, size)
-        self.data = memoryview(self._map)
+        self.data, self._words = memoryview(self._map), words_of(self._map)
         self._event = os.eventfd(0, os.EFD_CLOEXEC)
         self._poll = select.epoll()
         # Edge-triggered: each write of the reader wakes us once, and nothing has to be read.
@@ -158,13 +157,13 @@ class ReaderClient:
         self._work_with(first)
         self._spare = self._spawn(first.alive)
         deadline = time.monotonic() + 10.0  # it needs about 0.05 s
-        while not WORD.unpack_from(self._map, READY)[0]:
+        while not self._words[READY]:
             if self._wait(deadline - time.monotonic()) is not True:
                 raise DriverError("the process that reads the robot's states does not start")
 
     def next(self, wait_s: float) -> Record | None:
         """The next datagram; None where none came within this time. Raises DriverError."""
-        WORD.pack_into(self._map, TAIL, self._taken)  # the last one may be written over
+        self._words[TAIL] = self._taken  # the last one may be written over
         if self._taken == self._head and not self._more(wait_s):
             return None
         start = reader.FIRST_SLOT + self._taken % SLOTS * self._step
@@ -182,7 +181,7 @@ class ReaderClient:
 
     def newest(self) -> int | None:
         """Start of the newest datagram that waits in `data`, of right length; None without."""
-        self._head = WORD.unpack_from(self._map, HEAD)[0]
+        self._head = self._words[HEAD]
         if self._head == self._taken:
             return None
         start = reader.FIRST_SLOT + (self._head - 1) % SLOTS * self._step
@@ -199,6 +198,7 @@ class ReaderClient:
                 reader_.end()
         self._poll.close()
         self.data.release()
+        self._words.release()
         self._map.close()
         os.close(self._event)
         os.close(self._memory)
@@ -207,7 +207,7 @@ class ReaderClient:
         """Wait until the head is ahead of us; False where the time is over."""
         deadline = 0.0
         while True:
-            self._head = WORD.unpack_from(self._map, HEAD)[0]
+            self._head = self._words[HEAD]
             if self._head != self._taken:
                 return True
             now = time.monotonic()

@@ -1,5 +1,6 @@
 """The FCI driver against a scripted peer that speaks the real wire formats."""
 
+import mmap
 import os
 import signal
 import socket
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.fci import FciArm, reader_client
+from drivers.fci import FciArm, reader, reader_client
 from drivers.fci.codec import id_at
 from drivers.fci.torque_control import TORQUE_STEP
 from drivers.interface import Driver, DriverError, NotReady
@@ -324,6 +325,29 @@ def test_silence_and_a_cut_connection(peer5, connected):
 
 
 # The reader's process
+
+FILLS = """
+import mmap, sys
+from drivers.fci.reader import TAIL, StateRing, ring_size
+ring = StateRing(mmap.mmap(int(sys.argv[1]), ring_size(8)), 8)
+while True:
+    ring.put(ring.space(), (1, bytes(4)), 3, 0, 1)
+    ring._words[TAIL] = ring._head
+"""
+
+
+def test_the_head_of_the_ring_never_goes_back():
+    """Two processes, one word: whoever reads it while it is written must not see a zero."""
+    fd = os.memfd_create("ring")
+    os.ftruncate(fd, reader.ring_size(8))
+    words = memoryview(mmap.mmap(fd, 0))[: reader.FIRST_SLOT].cast("Q")
+    with subprocess.Popen([sys.executable, "-c", FILLS, str(fd)], pass_fds=[fd]) as writer:
+        patiently(lambda: words[reader.HEAD])
+        heads = [words[reader.HEAD] for _ in range(3_000_000)]
+        writer.kill()
+    os.close(fd)
+    assert heads == sorted(heads)
+    assert heads[0] + 10_000 < heads[-1]
 
 
 def test_a_killed_reader_is_replaced(peer5, connected):
