@@ -43,12 +43,14 @@ def left_without(before: Fit, after: Fit) -> set[int]:
 
 def notes_on(fit: Fit) -> list[str]:
     """Of each law: what it does with the joint's energy, and how far it was seen."""
-    notes, motion = [], fit.recordings[0].motion
+    notes: list[str] = []
     for k, e in enumerate(fit.named):
         law, joint = e.candidate.effect, e.candidate.joint
-        if not isinstance(law, Law | Curve) or e.recording is not None:
+        if not isinstance(law, Law | Curve):
             continue
-        power = fit.model.contribution(0, k)[:, joint] * fit.recordings[0].low_dq[:, joint]
+        where = fit.recordings[e.recording or 0]
+        motion = where.motion
+        power = fit.model.contribution(e.recording or 0, k)[:, joint] * where.low_dq[:, joint]
         given = float(-power[power < 0.0].sum() / max(np.abs(power).sum(), 1e-12))
         if law.variables == {"q"} and not law.by:
             does = "stores energy and gives it back, as a spring does"
@@ -145,19 +147,21 @@ def _gives_way(named: Named) -> bool:
 
 
 def _with_law(fit: Fit, joint: int) -> Fit:
-    """With one more law, or as it is where none is believed.
+    """With one more law, of one of several recordings as well, or as it is where none is believed.
 
     Those that are best at the settings tried are compared each at its own best setting.
     """
     best: dict[str, Lead] = {}
     table = SignatureTable(fit, [joint], FORMS, rich=False)
-    for lead in sorted(table.whole(), key=lambda lead: -lead.log_evidence):
+    leads = [*table.whole(), *table.apart(table.candidates)]
+    for lead in sorted(leads, key=lambda lead: -lead.log_evidence):
         if lead.candidate.possible(lead.x, lead.interval_s):
             best.setdefault(lead.candidate.effect.name, lead)
     found, most, place = fit, BELIEF, len(fit.named)
     for lead in list(best.values())[:BEST_OF_JOINT]:
         if lead.log_evidence > BELIEF:
-            more = _settled(fit.with_named((*fit.named, Named(lead.candidate, lead.x))), place)
+            new = Named(lead.candidate, lead.x, lead.interval_s, lead.recording)
+            more = _settled(fit.with_named((*fit.named, new)), place)
             nats = _together(more, [place])
             if nats > most:
                 found, most = more, nats

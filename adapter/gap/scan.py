@@ -74,6 +74,11 @@ class Lead:
     recording: int | None = None
     odds: float = 0.0
 
+    @property
+    def limits(self) -> int:
+        """How often it is limited: to one recording, and to a time of it."""
+        return (self.recording is not None) + (self.interval_s != WHOLE)
+
 
 def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, weight: Array) -> Noise:
     """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it.
@@ -295,6 +300,13 @@ class SignatureTable:
                 leads += self._best_intervals(i, own, edges, pairs)
         return leads
 
+    def apart(self, candidates: Sequence[Candidate]) -> list[Lead]:
+        """Each candidate in the whole of one of several recordings, and in no other."""
+        leads: list[Lead] = []
+        for i, t in enumerate(self.times if len(self.times) > 1 else ()):
+            leads += self._best_intervals(i, candidates, t[[0, -1]] + (0.0, 1.0), [(0, 1)])
+        return [replace(lead, interval_s=WHOLE) for lead in leads]
+
     def passing(self, candidates: Sequence[Candidate]) -> list[Lead]:
         """The best interval of each candidate inside each recording: it comes and goes."""
         leads = []
@@ -411,9 +423,11 @@ def leads_of(table: SignatureTable) -> list[Lead]:
             _keep(best, lead, "whole")
     # a pattern may change in mid-recording as well, but then it is a pattern all the more
     chosen = [x.candidate for x in always.values() if not isinstance(x.candidate.effect, Pattern)]
-    for lead in table.timed([c for c in chosen if not c.effect.steady]):
+    changing = [c for c in chosen if not c.effect.steady]
+    apart = table.apart([c for c in chosen if c in changing or isinstance(c.effect, Law)])
+    for lead in (*apart, *table.timed(changing)):
         if lead.candidate.possible(lead.x, lead.interval_s):
-            _keep(best, lead, "timed")
+            _keep(best, lead, "timed" if lead.limits > 1 else "apart")
     for lead in table.passing([c for c in chosen if c.effect.passing]):
         _keep(best, lead, "passing")
     return sorted(best.values(), key=lambda lead: -lead.log_evidence)
@@ -428,15 +442,15 @@ def honest_moves(table: SignatureTable, refused: set[tuple[str, int]]) -> list[M
     """
     leads = [x for x in leads_of(table) if x.candidate.key not in refused]
     found = [x for x in map(table.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
-    found = [x for x in found if x.chi2 > least_chi2(x.candidate.effect, x.interval_s)]
+    found = [x for x in found if x.chi2 > least_chi2(x.candidate.effect, x.limits > 0)]
     found = [x for x in found if not any(outdone(x, y) for y in found)]
     moves = [Move((x,), x.log_evidence) for x in found] + _bundles(table, leads, found)
     return sorted(moves, key=lambda x: -x.log_evidence)
 
 
-def least_chi2(effect: Effect, interval_s: tuple[float, float]) -> float:
-    """What an effect must explain to be named."""
-    if interval_s == WHOLE:
+def least_chi2(effect: Effect, limited: bool) -> float:
+    """What an effect must explain to be named, the more where it is not always there."""
+    if not limited:
         return CHI2_LEAST
     return CHI2_LEAST_SUDDEN if effect.sudden else CHI2_LEAST_DATED
 
@@ -454,7 +468,7 @@ def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
         if lead.log_evidence < 0.0 and (lawless or lead.chi2 < QUIETER * CHI2_LEAST):
             continue
         joint = lead.candidate.joint
-        plain = lead.candidate.effect.bundled and lead.interval_s == WHOLE
+        plain = lead.candidate.effect.bundled and not lead.limits
         if plain or place < BEST_OF_ALL or seen.get(joint, 0) < BEST_OF_JOINT:
             chosen.append(lead)
             seen[joint] = seen.get(joint, 0) + 1
@@ -468,7 +482,7 @@ def _bundles(table: SignatureTable, leads: Sequence[Lead], found: Sequence[Lead]
         own: dict[str, Lead] = {}  # of one thing in several forms the best
         for x in leads:
             effect = x.candidate.effect
-            if x.candidate.joint == joint and effect.bundled and x.interval_s == WHOLE:
+            if x.candidate.joint == joint and effect.bundled and not x.limits:
                 own.setdefault(effect.form or effect.name, x)
         if len(own) < 2 or max(x.log_evidence for x in own.values()) < BELIEF:
             continue
@@ -486,7 +500,7 @@ def outdone(lead: Lead, by: Lead) -> bool:
     if lead is by:
         return False
     if a.key == b.key:
-        more = lead.interval_s != WHOLE and by.interval_s == WHOLE
+        more = lead.limits > by.limits
         return more and lead.log_evidence < by.log_evidence + CHANGE_NATS + CHANGE_SHARE * by.chi2
     return simpler_wins((b, by.chi2), (a, lead.chi2))
 

@@ -164,9 +164,7 @@ def _round(
     moves = [
         move
         for move in moves
-        if not any(
-            x.interval_s == WHOLE and any(e.covers(x.candidate) for e in there) for x in move.leads
-        )
+        if not any(not x.limits and any(e.covers(x.candidate) for e in there) for x in move.leads)
     ]
     for move in moves[:3]:  # moves of a round
         again = _dated_anew_beside(fit, move)
@@ -349,12 +347,13 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
     values, others = {}, without_each(fit, carried)
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
+        limited = (e.recording is not None or e.interval_s != WHOLE) and not from_the_start(e)
         value = found.log_evidence + price(e) + e.candidate.effect.log_odds_of(e.values)
         if from_the_start(e) and e.possible and any(map(_puts_down, fit.named)):
             continue  # the hand held what it puts down
         if (
             value < BELIEF
-            or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
+            or found.chi2 < least_chi2(e.candidate.effect, limited)
             or not e.possible
             or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
             or not (from_the_start(e) or pays_held_out(fit, carried, others, k))

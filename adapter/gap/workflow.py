@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.effects.active import WHOLE
 from adapter.effects.catalogue import CATALOGUE, HELD, KNOWN
 from adapter.effects.robots import read_robot
 from adapter.gap.candidates import Candidate
@@ -462,7 +461,7 @@ def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen | None:
     G, _ = carried.part(rest).reduced(X @ X.T, X @ carried.N[rest].T, X @ carried.data)
     std, effect = c.prior_std, CATALOGUE[c.effect.name]
     ways = np.linalg.slogdet(np.eye(len(G)) + std[:, None] * G * std)[1]
-    asked = max(least_chi2(effect, WHOLE), 2.0 * (BELIEF - c.log_odds) + ways)
+    asked = max(least_chi2(effect, limited=False), 2.0 * (BELIEF - c.log_odds) + ways)
     asked = SURE**2 if effect is HELD else asked
     covariance = np.linalg.inv(G + np.diag((OPEN * std) ** -2.0))
     key = effect.phrase.key or effect.parameters[0].key

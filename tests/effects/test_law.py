@@ -175,6 +175,14 @@ def test_a_hidden_law_is_found_and_joins_the_model(law: Hidden) -> None:
     assert energy.get(law.name, "feeds energy in: ") in note
 
 
+def test_a_law_that_one_of_two_recordings_has_is_told_of_that_one() -> None:
+    (with_hose, c), without = HOSE.recorded(), record(arm(), Motion(15.0, seed=5)).log()
+    logs = [replace(log, path=Path(name)) for log, name in ((without, "a"), (with_hose, "b"))]
+    (found,) = find_gap(logs, panda_model()).findings
+    assert (found.effect, found.joints, found.recording) == (HOSE.name, (J + 1,), "b")
+    assert abs(found.parameters["c"] - c) < 3.0 * found.std["c"] < 0.5 * c
+
+
 def test_splines_are_scipys() -> None:
     """And beyond their range they stay as at its end."""
     x = np.linspace(-2.0, 3.0, 101)
