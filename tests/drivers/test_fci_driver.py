@@ -342,12 +342,13 @@ def test_the_head_of_the_ring_never_goes_back():
     os.ftruncate(fd, reader.ring_size(8))
     words = memoryview(mmap.mmap(fd, 0))[: reader.FIRST_SLOT].cast("Q")
     with subprocess.Popen([sys.executable, "-c", FILLS, str(fd)], pass_fds=[fd]) as writer:
-        patiently(lambda: words[reader.HEAD])
-        heads = [words[reader.HEAD] for _ in range(3_000_000)]
+        seen = 0
+        while 0 <= seen < 1_000_000 and writer.poll() is None:
+            head = words[reader.HEAD]
+            seen = head if head >= seen else -1
         writer.kill()
     os.close(fd)
-    assert heads == sorted(heads)
-    assert heads[0] + 10_000 < heads[-1]
+    assert seen >= 1_000_000
 
 
 def test_a_killed_reader_is_replaced(peer5, connected):
