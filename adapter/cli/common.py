@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import tempfile
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,7 @@ def configure(
     as_recorded = args.config is None and recorded is not None
     if as_recorded:
         config, unknown = config_recorded(recorded or {}, "configuration in the recording")
-        if unknown:
-            names = ", ".join(unknown)
+        if names := ", ".join(unknown):
             warn([f"recorded by another version: settings that this one has not: {names}"])
     else:
         config = read_config(args.config)
@@ -69,10 +69,8 @@ def configure(
         unsaid = not learner.effects and not as_recorded
         changes["effects"] = learnable(robot, REAL_ARM_EFFECTS if unsaid else learner.effects)
     warn([f"{robot.name}: {said}" for said in not_learned(robot, changes["effects"])])
-    if args.mode is not None:
-        changes["mode"] = args.mode
-    if args.seed is not None:
-        changes["seed"] = args.seed
+    given = {"mode": args.mode, "seed": args.seed}
+    changes |= {key: value for key, value in given.items() if value is not None}
     learner = dataclasses.replace(learner, **changes)
     pipeline = dataclasses.replace(config.pipeline, learner=learner)
     excitation = config.excitation
@@ -93,5 +91,6 @@ def recording_metadata(
     config: Config, robot: SelfModel, command: str, **more: Any
 ) -> dict[str, Any]:
     """What a recording carries so that a replay repeats the run."""
-    told = {"config": config_table(config), "version": program_version()}
+    begun = datetime.now(UTC).isoformat(timespec="seconds")
+    told = {"config": config_table(config), "version": program_version(), "begun": begun}
     return {**told, "robot": robot.name, "command": command, **more}

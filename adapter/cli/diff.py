@@ -141,9 +141,7 @@ def _change_words(change: Change) -> str:
 
 def _number(value: Any) -> str:
     """A number, or some."""
-    if value is None:
-        return "none"
-    return " ".join(f"{x:.3g}" for x in np.ravel(value))
+    return "none" if value is None else " ".join(f"{x:.3g}" for x in np.ravel(value))
 
 
 def difference_json(found: ModelDifference) -> dict[str, Any]:

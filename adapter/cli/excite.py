@@ -21,7 +21,6 @@ from adapter.control.excitation import RandomMotion
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.information import Expected, Information
 from adapter.control.limits import MotionLimits, need_complete
-from adapter.control.path_motion import PathMotion
 from adapter.control.settings import ExcitationSettings
 from adapter.control.sweeps import MOVES, SweepMotion
 from adapter.effects.phrases import DecidingExperiment
@@ -79,15 +78,18 @@ def run(args: argparse.Namespace) -> int:
         length_s = _sweeps(todo, limits, q0, settings).length_s
         swept = FreeMotion(arm, length_s, partial(_sweeps, todo))(limits, q0, settings)
         assert isinstance(swept, SweepMotion)
-        _write(args, folder, arm, swept, limits, swept.length_s)
+        plan = Plan(arm, swept, limits, arm.clearance(swept, swept.length_s))
+        _write(args, folder, plan, swept.length_s)
         return ExitCode.DONE
     designer = Designer(told, known.information).within(arm)
     designed = FreeMotion(arm, designer.seconds, designer)(limits, q0, settings)
     assert isinstance(designed, DesignedMotion)
     seconds, expected = _until(told, known, designed, args)
-    for line in _told(told, known, designed, limits, seconds, expected):
+    said = _told(told, known, designed, limits, seconds, expected)
+    for line in said:
         show(line)
-    _write(args, folder, arm, designed, limits, seconds)
+    plan = Plan(arm, designed, limits, arm.clearance(designed, seconds))
+    _write(args, folder, plan, seconds, said)
     if args.json is not None:
         args.json.write_text(to_json(_figures(told, designed, seconds, expected)))
     return ExitCode.DONE
@@ -240,16 +242,10 @@ def _sweeps(
 
 
 def _write(
-    args: argparse.Namespace,
-    folder: Path,
-    arm: ArmInCell,
-    motion: PathMotion,
-    limits: MotionLimits,
-    seconds: float,
+    args: argparse.Namespace, folder: Path, plan: Plan, seconds: float, said: Sequence[str] = ()
 ) -> None:
-    """The page and both files of a motion from its start to rest."""
-    names = arm.model.tree.joint_names
-    plan = Plan(arm, motion, limits, arm.clearance(motion, seconds))
+    """The page and both files of a motion from its start to rest, and what is said of it."""
+    motion, names = plan.motion, plan.arm.model.tree.joint_names
     lines = plan.lines(seconds)
     step_ns = round(1e9 / args.rate)
     rows = [np.array([motion.q, motion.dq, motion.ddq])]
@@ -271,7 +267,8 @@ def _write(
     for line in lines:
         show(line)
     show(f"{len(points)} points at {args.rate:g} Hz: {folder / 'motion.csv'}, motion.mcap")
+    worst = ["Least sure: " + "; ".join(" ".join(x.split()) for x in said[2:])] if said else []
     robot = [] if args.robot is None else ["--robot", args.robot]
     step = Step("Play it", command("run", "--motion", folder / "motion.csv", *robot))
     show(f"next: {step.why}: {step.command}")
-    say(f"As a page: {plan.write(folder / PLAN_PAGE, lines, [step])}")
+    say(f"As a page: {plan.write(folder / PLAN_PAGE, [*said[:2], *worst, *lines], [step])}")

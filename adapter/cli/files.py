@@ -24,7 +24,7 @@ from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.runs.terminal import print_table, show, warn, write_json
-from adapter.signals.importer import import_file, is_data_set, recording_log, table_log
+from adapter.signals.importer import import_file, is_table, recording_log, table_log
 from adapter.signals.recording import describe, summary
 from adapter.signals.source_signals import ImportSpec
 from drivers.files.mcap import Log, recover
@@ -72,8 +72,10 @@ def run_recover(args: argparse.Namespace) -> int:
 
 def run_info(args: argparse.Namespace) -> int:
     """Carry `info` out."""
-    if args.file.suffix == ".json":
-        model = check_effects(load_model(args.file), args.file)
+    path = args.file
+    if path.suffix in (".json", ".urdf", ".xml"):
+        own = path.suffix == ".json"
+        model = check_effects(load_model(path), path) if own else robot_of(args, str(path))
         lines = _model_lines(model)
         facts = {
             "name": model.name,
@@ -124,10 +126,8 @@ def run_effects(args: argparse.Namespace) -> int:
 
 def opened(args: argparse.Namespace) -> Log | None:
     """A table, or a recording in other units; None of a recording as it is. Raises DriverError."""
-    path = args.file
-    table = path.with_suffix("") if path.suffix == ".gz" else path
-    more = {"period_s": args.period, "episode": args.episode}
-    if table.suffix in (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet") or is_data_set(path):
+    path, more = args.file, {"period_s": args.period, "episode": args.episode}
+    if is_table(path):
         return table_log(ImportSpec.from_options([str(path)], args.columns, args.units, **more))
     if not (args.units or args.columns or any(x is not None for x in more.values())):
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,11 @@ from typing import Any
 from rich.progress import Progress
 from rich.table import Column
 
+from adapter import optional
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_urdf
+from adapter.errors import MeansError
 from adapter.model.model_file import save_model, whole_file
 from adapter.report import fleet_page
 from adapter.runs.fleet import fleet
@@ -27,14 +28,12 @@ def run(args: argparse.Namespace) -> int:
     robot = robot_of(args, args.model)
     given = fleet.found_logs(args.logs)
     folder = results_folder(args.out, "fleet")
-    manifest = fleet.Manifest({}, {})
-    if args.manifest is not None:
-        manifest = fleet.read_manifest(args.manifest)
+    manifest = fleet.read_manifest(args.manifest) if args.manifest else fleet.Manifest({}, {})
     how = args.workers, args.cluster, args.by, manifest, args.topic
     settings = fleet.Settings(folder, *how, told_of(args))
     fleet.forget(args.forget, robot, settings)
-    fleet.recall(args.remember, robot, settings)
-    say(f"{len(given)} recordings; moments are kept in {folder}")
+    fleet.forget(args.remember, robot, settings, back=True)
+    say(f"{len(given)} recording{'s' * (len(given) != 1)}; moments are kept in {folder}")
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("reading", total=len(given))
         settings = settings._replace(progress=lambda n, m: bar.update(task, completed=n, total=m))
@@ -83,11 +82,9 @@ def _write_table(found: fleet.Fleet, folder: Path) -> Path:
     listed = [{key: row.get(key) for key in columns} for row in rows]
     path = folder / "fleet.parquet"
     try:
-        arrow = importlib.import_module("pyarrow")
-        parquet = importlib.import_module("pyarrow.parquet")
-    except ImportError:
-        needs = "Parquet is written with pyarrow; pip install 'panda-adapter[tables]'"
-        warn([f"{path}: {needs}; a CSV table is written instead"])
+        arrow, parquet = optional.load("pyarrow"), optional.load("pyarrow.parquet")
+    except MeansError as error:
+        warn([f"{path}: {error}; a CSV table is written instead"])
         path = path.with_suffix(".csv")
         with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(listed[0]) if listed else ["log"])
@@ -119,5 +116,6 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
         "disagrees": " ".join(map(str, log.disagrees)),
         "stands_out": " ".join(out),
         "worth_nats": log.worth,
+        "notes": "; ".join(log.moments.notes),
         **by_joint,
     }

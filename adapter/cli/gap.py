@@ -34,8 +34,9 @@ from adapter.report.servo_page import render_servo_page
 from adapter.runs import terminal
 from adapter.runs.compiling import announce_compiling
 from adapter.screening.screen import RecordingRefused
+from adapter.signals.importer import read_log, read_position_log
 from adapter.simulate import Rollouts
-from drivers.files.mcap import Log, read_log, read_position_log
+from drivers.files.mcap import Log
 
 WITH_TORQUE = (  # options
     *("validate_from", "rounds", "turn_or_zero", "tau", "trust_log"),
@@ -118,7 +119,9 @@ def _without_empty_rollouts(result: GapResult) -> GapResult:
 
 
 def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None:
-    """Write URDF, page and figures beside the model; print the summary."""
+    """Print the summary; write URDF, page and figures beside the model."""
+    for line in console_summary(result):
+        terminal.output.print(Text.from_markup(line), soft_wrap=True)
     more: dict[str, Any] = {}
     for stale in ("report.html", "model.urdf"):  # of an earlier model
         (folder / stale).unlink(missing_ok=True)
@@ -130,8 +133,6 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
         page = write_whole(folder / "report.html", render_gap_page(result, folder))
         more["report"] = str(page)
     _write(args, folder, {**as_json(result), **more})
-    for line in console_summary(result):
-        terminal.output.print(Text.from_markup(line), soft_wrap=True)
     if "report" in more:
         terminal.show(f"report {more['report']}")
 

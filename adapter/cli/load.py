@@ -9,7 +9,7 @@ from adapter.gap.load import as_json, find_load, robot_lines, sentence
 from adapter.gap.torque_gains import as_told
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json
-from drivers.files.mcap import read_log
+from adapter.signals.importer import read_log
 
 
 def run(args: argparse.Namespace) -> int:

@@ -214,7 +214,12 @@ def _carry_out(command: Command, args: argparse.Namespace) -> int:
         optional.load("pybullet")
     run_by = command.run_by or f"adapter.cli.{args.command}:run"
     module, _, function = run_by.partition(":")
-    return int(getattr(import_module(module), function)(args))
+    with warnings.catch_warnings(record=args.command in ("gap", "load")) as held:
+        try:
+            return int(getattr(import_module(module), function)(args))
+        finally:  # of the model after the answer, once
+            said = [str(x.message) for x in held or () if issubclass(x.category, ModelWarning)]
+            warn({text.rpartition("/")[2]: text for text in reversed(said)}.values())
 
 
 def _told(value: Any) -> Any:

@@ -153,7 +153,7 @@ def check_learning(args: argparse.Namespace) -> None:
 def check_robot(*names: str | None) -> None:
     """Refuse what is neither a known robot nor a file of one. Raises UsageError."""
     for name in names:
-        if name is None or name in robot_names():
+        if name is None or name in robot_names() or (Path(name) / "model.json").is_file():
             continue
         if Path(name).suffix.lower() == ".xacro":
             urdf = f"{name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"

@@ -23,8 +23,9 @@ from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import DISAGREEMENT, console, labelled, results_folder, say, show, warn
 from adapter.screening.screen import check_torque
 from adapter.signals.frame_topics import with_base_motion, with_link_imus
+from adapter.signals.importer import read_log
 from adapter.signals.matching import matching, present
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import Log
 
 
 def run(args: argparse.Namespace) -> int:

@@ -144,6 +144,4 @@ def across(bodies: Bodies, channel: str, link: int, joints: np.ndarray) -> Array
 def lever(motion: dict[str, Array], channel: str, body: int) -> Array:
     """(m, 3, 3): what a place is multiplied with in v ([w ×]) and a ([dw ×] + [w ×][w ×])."""
     turn = skew(motion["w"][:, body])
-    if channel == "v":
-        return turn
-    return np.asarray(skew(motion["dw"][:, body]) + turn @ turn)
+    return turn if channel == "v" else np.asarray(skew(motion["dw"][:, body]) + turn @ turn)

@@ -74,7 +74,10 @@ class Several:
             nominal: the documented arm on all recordings, which are called `names`.
             frame: in whose axes loads are told.
         """
-        fits = [_apart(nominal, i) for i in range(len(nominal.recordings))]
+        # each alone, with a load, and all that may be beside it
+        whole, named = nominal.model, with_a_load(nominal)
+        models = [replace(whole, recordings=(x,), named=named) for x in nominal.recordings]
+        fits = [replace(nominal, model=x, noise=(), doubts=()) for x in models]
         for first in (True, False):
             # one arm's noise: its own would hide by how much a recording is of another
             own = [fit.own_noise()[0] for fit in fits]
@@ -173,13 +176,6 @@ def _row(name: str, load: HandLoad) -> LogLoad:
     com = tuple(map(float, load.com)) if load.com_shown else None
     std = tuple(map(float, load.com_std)) if load.com_shown else None
     return LogLoad(name, load.is_there, load.mass, load.mass_std, com, std, load.frame)
-
-
-def _apart(nominal: Fit, i: int) -> Fit:
-    """One recording alone, with a load, and all that may be beside it."""
-    named = with_a_load(nominal)
-    model = replace(nominal.model, recordings=(nominal.recordings[i],), named=named)
-    return replace(nominal, model=model, noise=(), doubts=())
 
 
 def contradictions(fit: Fit, together: Together) -> list[Difference]:

@@ -63,9 +63,10 @@ from adapter.screening.screen import (
     standing,
 )
 from adapter.screening.timing import lateness
+from adapter.signals.importer import read_log
 from adapter.signals.matching import present
 from adapter.signals.told import AS_RECORDED, Told
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import Log
 
 SEARCHED_S = 20.0  # of several recordings
 NO_NAME = 0.5  # probability below which an effect is not told by name

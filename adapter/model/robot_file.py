@@ -60,9 +60,7 @@ def check_links(file: str, links: Mapping[str, Array]) -> None:
         spread = (least + middle + most) / 2.0
         if mass < LIGHT * heaviest or spread <= POINT_M2 * mass:
             continue
-        # no body of this density has its mass as near to its centre as a ball of it
-        ball = 4.0 / 3.0 * math.pi * (5.0 / 3.0 * spread / mass) ** 1.5
-        if mass >= PLACEHOLDER_KG and mass > DENSEST * ball:
+        if in_grams(theta):
             grams.append(f"'{name}' of {mass:.4g} kg")
         elif most - middle - least > 2.0 * ROUNDED * spread:
             told = ", ".join(f"{x:.3g}" for x in (least, middle, most))
@@ -71,6 +69,15 @@ def check_links(file: str, links: Mapping[str, Array]) -> None:
           "is its mass in grams? Give kg and kg m²")  # fmt: skip
     _warn(file, "no body has the principal moments of inertia of link", impossible,
           "none may be larger than the other two together, or below zero")  # fmt: skip
+
+
+def in_grams(theta: Array) -> bool:
+    """Whether a body (10,) is denser than any metal, its mass being as near to its centre."""
+    mass, _, tensor = body_from_theta(theta)
+    spread = max(np.trace(tensor) / 2.0, 0.0)
+    # no body of this density has its mass as near to its centre as a ball of it
+    ball = 4.0 / 3.0 * math.pi * (5.0 / 3.0 * spread / mass) ** 1.5 if mass > 0.0 else 0.0
+    return bool(mass >= PLACEHOLDER_KG and spread > POINT_M2 * mass and mass > DENSEST * ball)
 
 
 def made_up(theta: Array) -> list[int]:
@@ -121,7 +128,8 @@ def check_moving(file: str, bodies: Sequence[tuple[str, str, int, Array, bool]])
 
 def _warn(file: str, what: str, found: Sequence[str], do: str) -> None:
     if found:
-        warnings.warn(f"{file}: {what} {', '.join(found)}; {do}", ModelWarning, stacklevel=5)
+        named = ", ".join(found if len(found) < 5 else [*found[:3], f"{len(found) - 3} more"])
+        warnings.warn(f"{file}: {what} {named}; {do}", ModelWarning, stacklevel=5)
 
 
 TURNING = ("revolute", "continuous")

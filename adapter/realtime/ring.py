@@ -149,9 +149,7 @@ class Ring:
         head = self.pushed
         count = max(min(count, head, self.rows - 1), 0)
         found: Array = self._table[np.arange(head - count, head) % self.rows]
-        if self.pushed - (head - count) >= self.rows:
-            return found[:0]
-        return found
+        return found[:0] if self.pushed - (head - count) >= self.rows else found
 
     def take(self, count: int) -> None:
         """Consumer: the next `peek` begins `count` records later; they are kept for a successor."""

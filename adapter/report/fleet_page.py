@@ -20,15 +20,15 @@ from adapter.model.self_model import LEAST_STD
 from adapter.report.html import fill, write_whole
 from adapter.report.style import Drawing, Panel, joint_color, legend
 from adapter.report.tables import Table
-from adapter.report.words import with_doubt
+from adapter.report.words import NARROW, with_doubt
 from adapter.runs.fleet.arm import DAY_S, TIME, FleetArm, OfLog
 from adapter.runs.fleet.course import Drift
 from adapter.runs.fleet.fleet import Fleet
+from adapter.runs.fleet.moments import EPOCH_S
 
 HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
-EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 MOST_ROWS = 300  # of recordings on the page; of more those to say something of
-MOMENTS = ("path", "content", "begin_s", "span_s", "samples")  # of a recording, as figures
+MOMENTS = ("path", "content", "begin_s", "span_s", "samples", "notes")  # of a recording, as figures
 
 
 def log_rows(arm: FleetArm, numbers: Iterable[int]) -> list[tuple[str, ...]]:
@@ -49,8 +49,9 @@ def log_rows(arm: FleetArm, numbers: Iterable[int]) -> list[tuple[str, ...]]:
 
 
 def called(arm: FleetArm) -> list[str]:
-    """Names of an arm's recordings, with folders where two files have the same."""
-    return names_of([log.moments.path for log in arm.logs])
+    """Names of an arm's recordings, with folders where two have the same; of runs the folders."""
+    names = names_of([log.moments.path for log in arm.logs])
+    return [name.removesuffix("/recording.mcap") for name in names]
 
 
 def to_be_shown(arm: FleetArm, most: int) -> list[int]:
@@ -63,7 +64,7 @@ def to_be_shown(arm: FleetArm, most: int) -> list[int]:
 
 
 def _signed(value: float, std: float) -> str:
-    return "+" * (value > 0.0) + plus_minus(value, std)
+    return "+" * (value > 0.0) + with_doubt(value, std)
 
 
 def drift_words(drift: Drift) -> str:
@@ -108,6 +109,12 @@ def sentences(arm: FleetArm) -> list[str]:
                 f"arm, or a change{'' if log.used else '; the model is learned without it'}"
             )
     found += standing_out_words(arm)
+    noted = dict[str, list[str]]()
+    for name, log in zip(names, arm.logs, strict=True):
+        for note in log.moments.notes:
+            noted.setdefault(note, []).append(name)
+    for note, of in noted.items():
+        found.append(f"{', '.join(of) if len(of) < 4 else f'{len(of)} recordings'}: {note}")
     used = [(x, name) for name, x in zip(names, arm.logs, strict=True) if x.used]
     if len(used) > 1:
         best, name = max(used, key=lambda one: one[0].worth)
@@ -120,16 +127,17 @@ def sentences(arm: FleetArm) -> list[str]:
 
 def _less(worth: float) -> str:
     """By how much standard deviations become less with so many nats a parameter more."""
-    return f"{-100.0 * np.expm1(-worth):.2g} %"
+    return f"{-100.0 * np.expm1(-worth):.2g}{NARROW}%"
 
 
 def summary(found: Fleet) -> list[str]:
     """What was done, in one line."""
     arms = len(found.arms)
     parts = ["1 arm" if arms == 1 else f"{arms} arms"]
-    parts += [f"{found.read} recordings read", f"{found.known} known"]
-    for number, word in ((len(found.broken), "broken"), (len(found.forgotten), "forgotten")):
-        parts += [f"{number} {word}"] if number else []
+    parts.append(f"{found.read} recording{'s' * (found.read != 1)} read")
+    left = {"broken": found.broken, "forgotten": found.forgotten, "only planned": found.plans}
+    numbers = {"known": found.known, **{word: len(x) for word, x in left.items()}}
+    parts += [f"{number} {word}" for word, number in numbers.items() if number]
     return [", ".join(parts), *_law_words(found)]
 
 
@@ -156,6 +164,7 @@ def as_json(found: Fleet) -> dict[str, Any]:
         "broken": [x._asdict() for x in found.broken],
         "forgotten": list(found.forgotten),
         "alike": [list(pair) for pair in found.alike],
+        "plans": list(found.plans),
         "arms": [_arm_json(arm) for arm in found.arms],
         "notes": summary(found)[1:],
     }
@@ -193,12 +202,9 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
     Raises:
         RunFolderError: the file cannot be written.
     """
-    context: dict[str, Any] = {
-        "lines": summary(found),
-        "arms": [_arm(arm) for arm in found.arms],
-        "broken": Table(("recording", "why"), list(found.broken)),
-        "forgotten": found.forgotten,
-    }
+    told = {"lines": summary(found), "arms": [_arm(arm) for arm in found.arms]}
+    broken = Table(("recording", "why"), list(found.broken))
+    context = {**told, "broken": broken, "forgotten": found.forgotten}
     return write_whole(path, fill("fleet.html", context))
 
 
@@ -235,6 +241,8 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
     begin = np.array([log.moments.begin_s for log in used])
     days = (begin - begin.min()) / DAY_S
     label = "days after the first recording" if begin.min() > EPOCH_S else "days on the arm's clock"
+    if begin.min() < EPOCH_S and (np.ptp(days) < 1.0 or begin.max() >= EPOCH_S):  # own clocks
+        days, label = np.arange(1.0, len(used) + 1.0), "recording, as in the table"
     panels = []
     for k, name in enumerate(arm.effects):
         drawing = Drawing("half")

@@ -35,6 +35,7 @@ from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, last_s, replay
 from adapter.screening.screen import check_torque
+from adapter.signals.importer import read_log as read_any
 from adapter.signals.matching import matching, present
 from adapter.signals.records import stamps_of
 from drivers.files.html_table import html_table
@@ -84,7 +85,7 @@ def load_model(
 def read_log(
     path: str | Path, joint_names: Sequence[str] | None = None, topic: str | None = None
 ) -> Log:
-    """Read a recording (MCAP, rosbag2, ROS 1), whole or cut, by whatever recorder.
+    """Read a recording (MCAP, rosbag2, ROS 1), whole or cut, or a table whose headers tell it.
 
     Args:
         path: the file, or a folder of rosbag2.
@@ -102,7 +103,7 @@ def read_log(
     >>> adapter.read_log("recordings/panda_nominal_6s.mcap")
     Log(panda_nominal_6s.mcap: 6001 samples of 7 joints, 6.0 s)
     """
-    return read_mcap(path, joint_names, topic)
+    return read_mcap(path, joint_names, topic) if joint_names else read_any(path, topic)
 
 
 def make_log(
@@ -542,7 +543,7 @@ def _fitting(model: SelfModel | str | Path, log: Log) -> tuple[SelfModel, Log]:
 
 
 def _log(log: Log | str | Path) -> Log:
-    return log if isinstance(log, Log) else read_mcap(log)
+    return log if isinstance(log, Log) else read_any(log)
 
 
 def _joint_tables(model: SelfModel, *signals: ArrayLike) -> tuple[Array, ...]:

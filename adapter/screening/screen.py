@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.model.robot_file import in_grams
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.screening.likelihood import EVIDENCE, ROWS, Rows, Telling, explains_nothing, lateness_s
@@ -395,6 +396,10 @@ def judged(
         if told.trusted:
             return Judged(doubts=(f"{refusal} It is trusted all the same.",))
         said = f"{refusal} If it is as the model has it, --trust-log takes it so."
+        links = zip(model.tree.link_names, model.theta, strict=True)
+        if heavy := [f"{name} ({x[0]:.4g} kg)" for name, x in links if in_grams(x)]:
+            said = f"{model.name}: no torque fits links denser than any metal: {', '.join(heavy)}"
+            said += "; give their masses in kg, not in grams, in the robot's file"
         raise RecordingRefused(refusal.kind, said) from None
 
 

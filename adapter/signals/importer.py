@@ -1,10 +1,7 @@
-"""Files of other tools, turned into a recording of the project's own.
+"""Files of other tools, as logs, and turned into a recording of the project's own.
 
-Tables: a specification says which file, column and unit holds which signal; they are number files
-as other tools write them (CSV, whitespace, one value a line, npz, Parquet, LeRobot). Recordings
-(bags of either ROS, MCAP): what is read is what `replay`, `gap` and `info` read of them; written
-are joint states, commands and the links' motion that belongs to them. The report says what looks
-doubtful.
+Of tables (CSV, one value a line, npz, Parquet, LeRobot) a specification says which file, column
+and unit holds which signal. Of recordings joint states, commands and the links' motion are taken.
 """
 
 from __future__ import annotations
@@ -26,6 +23,7 @@ from adapter.signals.source_table import lerobot_joints
 from drivers.errors import choices
 from drivers.files import mcap
 from drivers.files.bounded import read_text
+from drivers.files.mcap.read import Beside
 from drivers.interface import Array, DriverError
 
 _OF_TABLES = {"columns": {}, "flat": False, "period_s": None, "episode": None}  # not given
@@ -113,6 +111,28 @@ def _of_folder(
     listed = path / "joint_list.txt"
     names = read_text(listed).split() if listed.is_file() else ()
     return replace(spec, sources=sources, units={"time": "us", **spec.units}), tuple(names)
+
+
+def is_table(path: Path) -> bool:
+    """Whether a path is a table's, or a data set's, and no recording's."""
+    table = path.with_suffix("") if path.suffix == ".gz" else path
+    ends = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
+    return table.suffix in ends or is_data_set(path)
+
+
+def read_log(path: str | Path, topic: str | None = None, beside: Beside = "") -> mcap.Log:
+    """A recording, or a table whose headers say what it holds. Raises DriverError."""
+    if is_table(Path(path)):
+        return table_log(source_signals.ImportSpec.from_options([str(path)]))
+    return mcap.read_log(path, topic=topic, beside=beside)
+
+
+def read_position_log(path: Path, topic: str | None = None) -> mcap.Log | None:
+    """The same of commands and positions alone; None of a log of another kind."""
+    if not is_table(path):
+        return mcap.read_position_log(path, topic)
+    log = read_log(path)
+    return None if log.commands is None or np.isfinite(log.tau).any() else log
 
 
 def table_log(spec: source_signals.ImportSpec) -> mcap.Log:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter import optional
 from drivers.files.mcap import Log, read_log, read_position_log
 from drivers.interface import Array, DriverError
 
@@ -33,16 +33,12 @@ def write_lerobot(path: Path, folder: Path) -> list[str]:
     is the command that held at each sample, of an arm that tells torques `observation.effort`.
 
     Raises:
-        DriverError: the recording is unreadable, or the folder holds something.
+        DriverError: the recording is unreadable, or the folder holds something. MeansError: no
+            PyArrow.
     """
     if folder.exists() and any(folder.iterdir()):
         raise DriverError(f"{folder}: holds something; give a new folder")
-    try:
-        pa, parquet = (importlib.import_module(name) for name in ("pyarrow", "pyarrow.parquet"))
-    except ImportError as error:
-        raise DriverError(
-            f"{folder}: Parquet is written with pyarrow; pip install 'panda-adapter[tables]'"
-        ) from error
+    pa, parquet = optional.load("pyarrow"), optional.load("pyarrow.parquet")
     log = read_position_log(path) or read_log(path)
     told, said = _signals(log)
     rows, n = len(log), len(log.joint_names)

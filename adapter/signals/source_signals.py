@@ -31,7 +31,7 @@ _TOLD = {  # words of a header that name a signal, and beginnings of such
     "time": ({"t"}, ("time", "zeit", "stamp")),
     "q": ({"q", "pos"}, ("posit", "winkel", "gelenkwinkel", "angle", "istposit")),
     "dq": ({"dq", "qd", "vel"}, ("veloc", "geschw", "speed", "drehz")),
-    "tau": ({"tau"}, ("torque", "moment", "drehmom", "effort")),
+    "tau": ({"tau", "trq"}, ("torque", "moment", "drehmom", "effort")),
     "cmd": (
         {"cmd", "ref", "des"},
         ("command", "action", "soll", "target", "goal", "desired", "setpoint"),
@@ -294,6 +294,9 @@ class SourceReader:
         if not places:
             places, known = _named(signal, table.names)
         places = [i for i in places if not table.is_text(i)][: 1 if signal == "time" else None]
+        told = {i: re.findall(r"\d+", re.split(r"[\[(]", table.names[i])[0]) for i in places}
+        if len({*map(tuple, told.values())}) == len(told) == sum(map(len, told.values())):
+            places = sorted(told, key=lambda i: [int(x) for x in told[i]])  # J7 to J1 are 1 to 7
         names = dict.fromkeys(re.sub(r"\[\d+\]$", "", table.names[i]) for i in places)
         self.called[signal] = ",".join(names)
         if names and not known:

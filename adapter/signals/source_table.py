@@ -10,7 +10,6 @@ import codecs
 import csv
 import fnmatch
 import gzip
-import importlib
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from adapter import optional
 from drivers.files.bounded import ARRAYS_LIMIT, parse_json, read_arrays, read_text
 from drivers.interface import Array, DriverError
 
@@ -207,12 +207,7 @@ def read_parquet(path: Path, episode: int | None = None) -> SourceTable:
     Raises:
         DriverError: unreadable, no numbers, or several episodes and none chosen; says what it has.
     """
-    try:
-        parquet = importlib.import_module("pyarrow.parquet")
-    except ImportError as error:
-        raise DriverError(
-            f"{path}: Parquet is read with pyarrow; pip install 'panda-adapter[tables]'"
-        ) from error
+    parquet = optional.load("pyarrow.parquet")
     files = sorted((path / "data").rglob("*.parquet")) if path.is_dir() else [path]
     if not files:
         raise DriverError(f"{path}: has no Parquet file in data/; is it a LeRobot data set?")

@@ -84,9 +84,7 @@ UNDOCUMENTED = Status("undocumented status", "switch the motor off and on, and a
 
 def fault_of(status: int) -> Status | None:
     """What is wrong with a motor of this status; None where it is enabled or disabled."""
-    if status in (DISABLED, ENABLED):
-        return None
-    return FAULTS.get(status, UNDOCUMENTED)
+    return None if status in (DISABLED, ENABLED) else FAULTS.get(status, UNDOCUMENTED)
 
 
 def type_of(limits: Scales) -> str:

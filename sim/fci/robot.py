@@ -409,9 +409,7 @@ class CommandedMotion:
     @property
     def success_rate(self) -> float:
         """Share of the last 100 commands that arrived."""
-        if not self.begun:
-            return 0.0
-        return int(self._arrived.sum()) / min(self._ticks, WINDOW)
+        return 0.0 if not self.begun else int(self._arrived.sum()) / min(self._ticks, WINDOW)
 
     def take(self, command: RobotCommand | None) -> str | None:
         """The command of a tick, or None where it is missing; the error that ends the motion."""

@@ -8,12 +8,14 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
 from adapter.model.model_file import load_model
 from drivers.files.mcap import read_log, write_log
+from drivers.files.mcap.writer import McapWriter
 
 RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 
@@ -48,9 +50,8 @@ def test_what_is_left_behind(folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert "torn.mcap" in page and "left" in page
     printed = capsys.readouterr()
     assert "one.mcap" in printed.out and "left out" in printed.err
-    assert fleet("--out", out, "--forget", folder / "logs" / "left" / "one.mcap") == (
-        ExitCode.NOTHING_LEARNED
-    )
+    gone = folder / "logs" / "left" / "one.mcap"
+    assert fleet("--out", out, "--forget", gone) == ExitCode.NOTHING_LEARNED
 
 
 def test_recordings_of_one_name_are_told_apart_by_their_folders(
@@ -58,11 +59,15 @@ def test_recordings_of_one_name_are_told_apart_by_their_folders(
 ) -> None:
     for day in ("monday", "friday"):
         (tmp_path / day).mkdir()
+    log, dated = read_log(RECORDING), {"begun": "2026-05-01T12:00:00+00:00"}
     shutil.copy(RECORDING, tmp_path / "monday" / "recording.mcap")
-    write_log(read_log(RECORDING), tmp_path / "friday" / "recording.mcap", {})
+    write_log(log, tmp_path / "friday" / "recording.mcap", dated)
+    with McapWriter(tmp_path / "friday" / "motion.mcap", log.joint_names) as plan:
+        plan.write_trajectory(log.stamp_ns[:9], np.stack([log.q[:9], log.dq[:9], log.dq[:9]], 1))
     assert fleet(tmp_path, "--out", tmp_path / "out", "--no-report") == 0
-    said = capsys.readouterr().out.replace("\n", "")
-    assert "monday/recording.mcap" in said and "friday/recording.mcap" in said
+    printed = capsys.readouterr()
+    assert "\nmonday  " in printed.out and "\nfriday     2026-05-01 12:00" in printed.out
+    assert "2 recordings read, 1 only planned" in printed.out and "left out" not in printed.err
 
 
 def test_without_pyarrow_a_csv_table(

@@ -1,7 +1,4 @@
-"""Fleets: moments that add up exactly, loads, drifts, logs that disagree, stores that go on.
-
-And what drifts and what stands out among recordings: on numbers whose truth is known.
-"""
+"""Fleets: moments that add up exactly, loads, drifts, logs that disagree, stores that go on."""
 
 from __future__ import annotations
 
@@ -35,7 +32,6 @@ from adapter.runs.fleet.fleet import (
     learn_fleet,
     on_cluster,
     read_manifest,
-    recall,
 )
 from adapter.runs.fleet.moments import Broken, LogMoments, Task, learner_of, moments_of
 from adapter.runs.pipeline import make_front_end
@@ -116,9 +112,8 @@ def test_a_law_that_only_some_arms_have_is_told(tmp_path: Path) -> None:
     found = learn_fleet(found_logs([str(tmp_path)]), model, Settings(tmp_path, workers=0))
     _, said = summary(found)
     assert said.startswith("Not all arms have a torque of c dq³ on joint 2 (N m s³/rad³): A has (")
-    assert (
-        ", B not (" in said and said in write_fleet_page(found, tmp_path / "page.html").read_text()
-    )
+    page = write_fleet_page(found, tmp_path / "page.html").read_text()
+    assert ", B not (" in said and said in page
 
 
 def test_logs_are_told_apart_and_broken_ones_said(fleet: Fleet) -> None:
@@ -350,7 +345,7 @@ def test_a_log_that_has_grown_counts_once(logs: Path, tmp_path: Path) -> None:
     forget([str(moved)], panda_model(), settings)
     left = [x for arm in learn_fleet([], panda_model(), settings).arms for x in arm.logs]
     assert all(x.moments.content != same.moments.content for x in left)
-    recall([str(moved)], panda_model(), settings)
+    forget([str(moved)], panda_model(), settings, back=True)
     shutil.copy(whole, moved)
     assert learn_fleet([str(moved)], panda_model(), settings).read == 1
 

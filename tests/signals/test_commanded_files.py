@@ -9,6 +9,7 @@ import pytest
 
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
+from adapter.signals import importer
 from drivers.files.mcap import read_log, read_position_log
 from tests.helpers.bags import JOINTS, Motion, write_controller_states, write_ros2
 
@@ -187,15 +188,16 @@ def test_headers_that_say_their_units(tmp_path, code, point):
     state, nothing = np.where(TIME > 1.0, "fährt", "steht"), np.full(len(TIME), "")
     time, *signals = 1e3 * TIME, np.degrees(Q), 1e3 * TAU
     german = "Zeit [ms];A1 pos [°];A2 pos [°];A1 torque [mNm];A2 torque [mNm];Zustand"
-    english = "angle 1;angle 2;x speed;Drehmoment 1;Drehmoment 2;time\ndeg;deg;;mNm;mNm;ms"
+    english = "angle 2;angle 1;x speed;Drehmoment 2;Drehmoment 1;time\ndeg;deg;;mNm;mNm;ms"
     for header, columns in (
         (german, (time, *signals, state)),
-        (english, (signals[0], nothing, signals[1], time)),
+        (english, (signals[0][:, ::-1], nothing, signals[1][:, ::-1], time)),
     ):
         path = table(tmp_path / "a.csv", *columns, header=header, point=point, code=code)
         log = imported(tmp_path, path)
         assert np.allclose(log.q, Q) and np.allclose(log.tau, TAU)
         assert np.array_equal(log.stamp_ns, np.round(TIME * 1e9))
+        assert np.allclose(importer.read_log(path).q, Q)
 
 
 def test_a_rail_beside_joints_that_turn(tmp_path, capsys):

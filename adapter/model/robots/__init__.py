@@ -125,7 +125,7 @@ def documented(
     `effects.robots.read_robot` takes an MJCF, too.
 
     Args:
-        name: one of `names()`, or the path of a file.
+        name: one of `names()`, or the path of a file, or of a run's folder.
         joints: which joints are wanted, all where None; the others are locked.
         floating: whether the base is free.
         gravity: (3,) acceleration of gravity in base axes, m/s²; the file's own where None.
@@ -134,7 +134,9 @@ def documented(
     Raises:
         ModelError: unknown name (names the choices), or a file that can't be read.
     """
-    text = str(name)
+    text, of_run = str(name), Path(name) / "model.json"
+    if text not in names() and of_run.is_file():
+        text = str(of_run)
     if text in names():
         return read_urdf(FOLDER / f"{text}.urdf", joints, floating, gravity, lock)
     suffix = Path(text).suffix.lower()

@@ -21,7 +21,7 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.runs.fleet.course import CHANCE, TINY, Drift, Series, StandsOut, courses
-from adapter.runs.fleet.moments import LogMoments, effects_for, learner_of
+from adapter.runs.fleet.moments import EPOCH_S, LogMoments, learner_of, learning_of
 from adapter.runs.outcome import Outcome, collect, learned_model
 
 ROUNDS = 5  # of who agrees to the model that these make
@@ -115,7 +115,7 @@ def learn_arm(
         used = [x for x in found if x.content in agreeing]
     learner.start_theta(round(1e9 * min(x.begin_s for x in used)))
     learner.learned = sum(x.samples for x in used)
-    theta, outcome, effects = learner.theta, collect(learner), effects_for(documented)
+    theta, outcome, effects = learner.theta, collect(learner), learning_of(documented).effects
     model = learned_model(outcome, documented, fleet=[x.path for x in used])
     drifts, out = courses(_series(logs, effects), _columns(logs, told or {}))
     solution = theta.th.copy()
@@ -152,11 +152,7 @@ def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array])
 
 
 def _solution(theta: Theta) -> Array:
-    """Least squares, refined once: what is left over is small, and counted in more digits.
-
-    Without that rounding in directions that only the prior holds reaches 1e-9 of the standard
-    deviations of those that data show.
-    """
+    """Least squares, refined once in more digits, since rounding reaches 1e-9 of the deviations."""
     th, at = theta.least_squares(), theta.known()
     H, rhs = theta.information()
     wide = np.longdouble
@@ -294,10 +290,7 @@ def _of_logs(
 
 
 def _worse(log: OfLog, usual: Array, logs: int) -> tuple[int, ...]:
-    """Joints (from 1) that the arm's model fits worse than is usual, and than could be.
-
-    The few samples of a short recording may be worse than is usual by chance.
-    """
+    """Joints (from 1) that the arm's model fits worse than is usual, than could be, than chance."""
     least = np.maximum(usual, log.own_rmse)
     count = max(log.moments.count, 1.0)
     chance = chi2.sf(count * np.square(log.rmse / np.maximum(least, TINY)), count)
@@ -330,7 +323,9 @@ def _series(logs: Sequence[OfLog], effects: Sequence[str]) -> list[Series]:
 def _columns(logs: Sequence[OfLog], told: Mapping[str, Mapping[str, float]]) -> dict[str, Array]:
     """What parameters may follow: time, and what the manifest tells of these recordings."""
     begin_s = np.array([x.moments.begin_s for x in logs])
-    columns: dict[str, Array] = {TIME: (begin_s - begin_s.min()) / DAY_S}
+    if begin_s.max() >= EPOCH_S:  # beside dates another clock's stamp is none
+        begin_s[begin_s < EPOCH_S] = np.nan
+    columns: dict[str, Array] = {TIME: (begin_s - np.nanmin(begin_s)) / DAY_S}
     own = [told.get(x.moments.content, {}) for x in logs]
     for name in sorted({key for row in own for key in row} - {TIME}):
         columns[name] = np.array([row.get(name, np.nan) for row in own])

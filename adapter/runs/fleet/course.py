@@ -1,12 +1,9 @@
 """How numbers of recordings go over time and over what a manifest tells, and which stand out.
 
-Each recording gives friction and offsets with standard deviations of its own; these say which is
-surer, not how sure. A line through them is held against what it leaves (Student's t), and its
-chance is multiplied by how many lines were tried (Bonferroni): one arm in a hundred in which
-nothing drifts has a false one. The same holds for those that stand out. How much a few numbers
-scatter is hardly known of one parameter alone; what all parameters of the arm leave says what to
-expect of one (moderated t: G. K. Smyth, Linear models and empirical Bayes methods for assessing
-differential expression in microarray experiments, Stat. Appl. Genet. Mol. Biol. 3, 2004).
+Each recording gives friction and offsets with standard deviations; these say which is surer, not
+how sure. A line through them is held against what it leaves (Student's t), its chance multiplied
+by how many were tried (Bonferroni). How much one parameter's few numbers scatter is told by those
+of all parameters (moderated t: G. K. Smyth, Stat. Appl. Genet. Mol. Biol. 3, 2004).
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import glob
-import importlib
 import logging
 import multiprocessing
 import os
@@ -25,6 +24,7 @@ from pathlib import Path, PurePosixPath
 from threading import Thread
 from typing import Any, NamedTuple, TypeVar
 
+from adapter import optional
 from adapter.errors import MeansError, SettingsError
 from adapter.model import model_file
 from adapter.model.self_model import SelfModel
@@ -41,6 +41,7 @@ from adapter.runs.fleet.moments import (
 )
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.names import RECORDINGS, is_recording
+from drivers.files.ros_types import JOINT_TRAJECTORY
 
 LOG_COLUMNS, ARM_COLUMN = ("log", "path", "file"), "arm"
 Found = TypeVar("Found")
@@ -91,6 +92,7 @@ class Fleet:
         read: how many recordings were read for this; known: whose moments were there already.
         forgotten: given, and left out as they were asked to be.
         alike: (path, path) of recordings with the same content, which count once.
+        plans: motions of somebody's design, which are no recordings.
     """
 
     arms: tuple[FleetArm, ...]
@@ -99,6 +101,7 @@ class Fleet:
     known: int
     forgotten: tuple[str, ...]
     alike: tuple[tuple[str, str], ...]
+    plans: tuple[str, ...] = ()
 
 
 def found_logs(given: Iterable[str]) -> list[str]:
@@ -213,7 +216,9 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
     read = len(left) - sum(x.path in {task.path for task in left} for x in work.broken)
     gone = tuple(path for path, content in work.contents.items() if store.forgotten(content))
     arms = _arms(store, heads, documented, settings)
-    return Fleet(arms, tuple(work.broken), read, len(heads) - read, gone, work.alike(tasks))
+    plans = tuple(x.path for x in work.broken if f"(1 {JOINT_TRAJECTORY})" in x.why)
+    broken = tuple(x for x in work.broken if x.path not in plans)
+    return Fleet(arms, broken, read, len(heads) - read, gone, work.alike(tasks), plans)
 
 
 def _store(documented: SelfModel, settings: Settings) -> Store:
@@ -223,14 +228,10 @@ def _store(documented: SelfModel, settings: Settings) -> Store:
 
 
 class _Work:
-    """What is known of given recordings, and what is to be done with them.
+    """What is known of given recordings: `contents` by path, `broken` ones, what is left to do.
 
     Args:
         store: of the fleet; marks: of the recordings by path, as they were before all reading.
-
-    Attributes:
-        contents: by path, of those whose content is known.
-        broken: those that could not be read.
     """
 
     def __init__(self, store: Store, marks: Mapping[str, str]) -> None:
@@ -278,8 +279,10 @@ class _Work:
         return tuple((path, other) for path, other in pairs if path != other)
 
 
-def forget(given: Sequence[str], documented: SelfModel, settings: Settings) -> None:
-    """Leave recordings out of the store from here on.
+def forget(
+    given: Sequence[str], documented: SelfModel, settings: Settings, back: bool = False
+) -> None:
+    """Leave recordings out of the store from here on; or take that `back`, to be read again.
 
     Args:
         given: paths that the store knows, though they may be gone by now, or what `found_logs`
@@ -289,18 +292,6 @@ def forget(given: Sequence[str], documented: SelfModel, settings: Settings) -> N
         SettingsError: one of them is neither.
     """
     store = _store(documented, settings)
-    store.forget(_contents_of(store, given, documented, settings))
-
-
-def recall(given: Sequence[str], documented: SelfModel, settings: Settings) -> None:
-    """Take back what `forget` did; the recordings are read again when they are given."""
-    store = _store(documented, settings)
-    store.recall(_contents_of(store, given, documented, settings))
-
-
-def _contents_of(
-    store: Store, given: Sequence[str], documented: SelfModel, settings: Settings
-) -> set[str]:
     known: dict[str, set[str]] = {}
     for content, path in [*((x.content, x.path) for x in store.heads()), *store.places().items()]:
         known.setdefault(path, set()).add(content)
@@ -314,7 +305,7 @@ def _contents_of(
     work.look_up(tasks, settings, remote=True)
     if work.broken:
         raise SettingsError(f"{work.broken[0].path}: cannot be looked at: {work.broken[0].why}")
-    return found | set(work.contents.values())
+    (store.recall if back else store.forget)(found | set(work.contents.values()))
 
 
 def _is_address(path: str) -> bool:
@@ -426,10 +417,7 @@ def _alone(function: Callable[[Task], Result], task: Task) -> Result | Broken:
 
 
 def _processes(count: int) -> ProcessPoolExecutor:
-    """Copies of a process that has loaded everything and runs no threads.
-
-    A copy of this very process would copy its threads' locks; a fresh one loads for seconds.
-    """
+    """Copies of a process that has loaded everything and runs no threads, whose locks they had."""
     forks = "forkserver" in multiprocessing.get_all_start_methods()
     context = multiprocessing.get_context("forkserver" if forks else "spawn")
     if forks:
@@ -462,12 +450,7 @@ def on_cluster(
         MeansError: Dask is not installed, nobody answers at the address, nobody works there, or
             the scheduler was lost; what came before is done.
     """
-    try:
-        distributed = importlib.import_module("distributed")
-    except ImportError:
-        raise MeansError(
-            "--cluster needs Dask distributed: pip install 'panda-adapter[cluster]'"
-        ) from None
+    distributed = optional.load("distributed")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said here
     left = dict.fromkeys(tasks)
     for number in range(3):  # a scheduler that is lost again and again
@@ -481,8 +464,7 @@ def on_cluster(
             try:
                 client.wait_for_workers(1, timeout=WORKER_S)
             except TimeoutError:
-                said = f"--cluster {address}: no worker came in {WORKER_S:.0f} s"
-                raise MeansError(said) from None
+                raise MeansError(f"--cluster {address}: no worker in {WORKER_S:.0f} s") from None
             for task, result in _sent(function, list(left), client, distributed):
                 del left[task]
                 yield task, result

@@ -12,9 +12,10 @@ import json
 import os
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,12 +34,14 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.replay import filtered_tables, fitted_to
 from adapter.screening.screen import check_torque
+from adapter.signals.importer import read_log
 from adapter.signals.matching import matching
 from adapter.signals.told import AS_RECORDED, Told
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import Log
 from drivers.interface import DriverError
 
-FORMAT = 1  # of the files of moments; another one is computed anew
+FORMAT = 2  # of the files of moments; another one is computed anew
+EPOCH_S = 1e9  # stamps below are no dates: a clock that counts from its start
 SEEN, FOLDER, GONE = "seen.jsonl", "moments", ".forgotten"
 ARM_KEYS = ("arm", "serial", "serial_number", "robot_serial", "arm_id")  # in a log's metadata
 
@@ -59,7 +62,7 @@ class Task(NamedTuple):
 
 
 class Broken(NamedTuple):
-    """A recording that could not be used, and the sentence that says why."""
+    """A file that could not be used, and the sentence that says why."""
 
     path: str
     why: str
@@ -73,10 +76,12 @@ class LogMoments:
         content: SHA-256 of the recording's bytes.
         path: where it was read.
         arm: name or serial number that the recording tells, None if it tells none.
-        begin_s, span_s: first stamp (s, on the recording's clock), and to the last one.
+        begin_s, span_s: first stamp (s, since 1970 where the recording tells its date), and to the
+            last one.
         samples: filtered states in the moments.
         count: independent samples that these are worth.
         A: moments of the joints' torques (see `Moments`), of samples that are independent.
+        notes: on the recording, a sentence each.
     """
 
     content: str
@@ -87,6 +92,7 @@ class LogMoments:
     samples: int
     count: float
     A: Array
+    notes: Sequence[str] = ()
 
     def save(self, path: Path) -> None:
         """Write them, whole or not at all."""
@@ -102,15 +108,15 @@ class LogMoments:
             return cls(A=A, **json.loads(str(kept["said"])))
 
 
-def effects_for(model: SelfModel) -> tuple[str, ...]:
-    """Effects learned beside θ: those of a real arm, but for those that need θ to be seen."""
+def learning_of(model: SelfModel) -> LearnerSettings:
+    """Beside θ the effects of a real arm are learned, but for those that need θ to be seen."""
     names = tuple(x.name for x in effects_by_name(REAL_ARM_EFFECTS) if not x.by_rates)
-    return learnable(model, names)
+    return LearnerSettings(effects=learnable(model, names))
 
 
 def learner_of(model: SelfModel) -> OnlineLearner:
     """A learner for moments of independent samples, none in it yet."""
-    learner = make_learner(model, PipelineSettings(learner=_learning(model)))
+    learner = make_learner(model, PipelineSettings(learner=learning_of(model)))
     learner.theta.noise_gain = 1.0
     return learner
 
@@ -169,9 +175,10 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
     log = matching(log, model)
     if not len(log):
         raise DriverError("no samples to learn from")
-    log, model, _ = check_torque(log, model)
-    settings, _ = fitted_to(log, PipelineSettings().filter)
-    both = PipelineSettings(filter=settings, learner=_learning(model))
+    log, model, said = check_torque(log, model)
+    settings, rate = fitted_to(log, PipelineSettings().filter)
+    said = [x.removeprefix(f"{log.path}: ") for x in dict.fromkeys([*log.warnings, *said, *rate])]
+    both = PipelineSettings(filter=settings, learner=learning_of(model))
     front_end, learner = make_front_end(model, both), make_learner(model, both)
     frames = model.joint_rotation(), model.lam[:, 3:]
     into, samples = learner.theta.empty_moments(), 0
@@ -188,8 +195,11 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
         raise DriverError("its numbers are beyond what can be added up")
     share = 1.0 / learner.theta.noise_gain
     begin, end = int(log.stamp_ns.min()), int(log.stamp_ns.max())
-    spans = 1e-9 * begin, 1e-9 * (end - begin)
-    return LogMoments(content, path, named, *spans, samples, share * samples, share * into.A)
+    begin_s, begun = 1e-9 * begin, log.metadata.get("begun")
+    if begin_s < EPOCH_S and isinstance(begun, str):
+        begin_s += datetime.fromisoformat(begun).timestamp()
+    spans = begin_s, 1e-9 * (end - begin)
+    return LogMoments(content, path, named, *spans, samples, share * samples, share * into.A, said)
 
 
 def arm_named(metadata: dict[str, Any]) -> str | None:
@@ -197,10 +207,6 @@ def arm_named(metadata: dict[str, Any]) -> str | None:
     entries = (metadata, *(x for x in metadata.values() if isinstance(x, dict)))
     told = (entry.get(key) for entry in entries for key in ARM_KEYS)
     return next(filter(None, (str(x).strip() for x in told if isinstance(x, str | int))), None)
-
-
-def _learning(model: SelfModel) -> LearnerSettings:
-    return LearnerSettings(effects=effects_for(model))
 
 
 _model = lru_cache(maxsize=4)(model_file.loads)
@@ -249,8 +255,6 @@ def _broken(path: str, error: Exception) -> Broken:
 class Store:
     """What a fleet has learned so far, on disk: moments by the content of log and model.
 
-    Each is written whole once it is there.
-
     Args:
         folder: made if it is not there.
         model: text of the model that the moments are taken with; those of others are not seen.
@@ -287,11 +291,7 @@ class Store:
         return content if mark and mark == before else None
 
     def remember(self, path: str, mark: str, content: str) -> None:
-        """Keep the content of a recording, so that it is not read again while it does not change.
-
-        Args:
-            mark: as it was before it was read, see `mark_of`.
-        """
+        """Keep the content of a recording, by `mark_of` it before it was read, for next time."""
         if mark and self._seen.get(path) != (mark, content):
             self._seen[path] = mark, content
             with self._seen_file.open("a", encoding="utf-8") as file:
@@ -325,10 +325,7 @@ class Store:
             self._path(content).with_suffix(GONE).unlink(missing_ok=True)
 
     def heads(self) -> list[LogMoments]:
-        """All that is known, without the moments themselves, in the order of content.
-
-        What was damaged is taken away, so that its recording is read again.
-        """
+        """All that is known, without the moments, by content; damaged ones go, to be read again."""
         paths = sorted(self._folder.glob(f"{self._model}-*.npz"))
         return [x for x in (self._read(path, False) for path in paths) if x is not None]
 
