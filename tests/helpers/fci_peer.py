@@ -21,7 +21,6 @@ COMMAND_SIZE = {5: 370, 10: 371}
 # version: (number format, its size, tau_J, tau_J_d, q, dq, generator mode, success rate)
 PLACES = {5: ("d", 1016, 1072, 1184, 1296, 2280, 2365), 10: ("f", 512, 540, 596, 652, 1288, 1373)}
 SET_COLLISION, SET_LOAD = {5: 4, 10: 3}, {5: 10, 10: 9}
-LOAD_AT = {5: 880, 10: 444}
 MOVE, STOP_MOVE, RECOVER = 1, 2, {5: 12, 10: 10}
 RUNNING = {5: 2, 10: 5}  # generator mode of a torque motion
 STARTED, NOT_POSSIBLE = 1, {5: 3, 10: 5}
@@ -48,7 +47,7 @@ def state(
     struct.pack_into("<Q", data, 0, message_id)
     for at, values in ((at_tau, tau), (at_tau_d, tau_d), (at_q, q), (at_dq, dq)):
         struct.pack_into(f"<7{number}", data, at, *values)
-    struct.pack_into(f"<13{number}", data, LOAD_AT[protocol], *load)
+    struct.pack_into(f"<13{number}", data, {5: 880, 10: 444}[protocol], *load)
     data[at_modes], data[at_modes + 1], data[at_modes + 84] = modes
     for index in errors:
         data[at_modes + 2 + index] = 1
@@ -218,7 +217,10 @@ class Peer:
             if answer[12:13] == b"\0":
                 self._where = ("127.0.0.1", port)
         elif command == MOVE:
-            self._move(command_id)
+            with self._lock:
+                self._say(MOVE, command_id, bytes([self.first_status]))
+                if self.first_status == STARTED:
+                    self.modes, self._move_id = (RUNNING[self.protocol], 2, 2), command_id
         elif command == STOP_MOVE and self.stop_status is not None:
             with self._lock:
                 if self.stop_status == 0:
@@ -236,12 +238,6 @@ class Peer:
                 if self.recover_status == 0:
                     self.modes, self.errors, self.reflex = (0, 3, 1), (), ()
                 self._say(command, command_id, bytes([self.recover_status]))
-
-    def _move(self, command_id: int) -> None:
-        with self._lock:
-            self._say(MOVE, command_id, bytes([self.first_status]))
-            if self.first_status == STARTED:
-                self.modes, self._move_id = (RUNNING[self.protocol], 2, 2), command_id
 
     def _say(self, command: int, command_id: int, payload: bytes) -> None:
         self._put(reply(command, command_id, payload))

@@ -8,11 +8,11 @@ import can
 import numpy as np
 import pytest
 
+from drivers.damiao.codec import CLEAR_ERROR, refresh
 from sim.damiao.faults import NAMES, board_faults
 from sim.damiao.server import Boards
 from sim.scenarios import build
 from tests.helpers.board_tools import (
-    CLEAR,
     IDS,
     NOTHING,
     PANDA,
@@ -20,7 +20,6 @@ from tests.helpers.board_tools import (
     Rig,
     frame,
     parse,
-    refresh,
     rig,
     two_buses,
 )
@@ -165,7 +164,9 @@ def test_electrical_faults_show_in_the_status_and_stay(name) -> None:
         assert abs(told[-1].tau) < 0.02
         others = [m.data[0] >> 4 for m in rows[-1] if m.arbitration_id != 0x16]
         assert others == [1] * 6
-        assert parse(bench.ask(6, CLEAR)[0], PANDA[5]).status == STATUS_OF[name]  # the cause stays
+        assert (
+            parse(bench.ask(6, CLEAR_ERROR)[0], PANDA[5]).status == STATUS_OF[name]
+        )  # the cause stays
 
 
 def test_a_hot_motor_lets_go_and_reports_its_temperature() -> None:
@@ -174,7 +175,7 @@ def test_a_hot_motor_lets_go_and_reports_its_temperature() -> None:
         told = parse(rows[-1][1], PANDA[1])
         far = abs(bench.boards.world.state()[1][1] - READY[1])
     assert told.status == 0xC
-    assert told.rotor > 100
+    assert told.rotor_degc > 100
     assert far > 0.001
 
 
