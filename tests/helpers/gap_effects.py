@@ -159,17 +159,8 @@ def _dahl(q: Array, dq: Array, s0: float) -> Array:
     return out
 
 
-def _low_passed(t: Array, x: Array, d: float, c: float) -> Array:
-    """x (m,) behind 1 / (1 + d s + (d^2 - c) s^2), by its spectrum; constant before the start."""
-    padded = np.pad(x, PAD, mode="linear_ramp", end_values=x[0])
-    s = 2j * np.pi * np.fft.rfftfreq(len(padded), t[1] - t[0])
-    spectrum = np.fft.rfft(padded) / (1 + d * s + (d * d - c) * s**2)
-    return np.fft.irfft(spectrum, len(padded))[PAD:-PAD]
-
-
-def torque_sensor(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
-    """What the torque sensors read (m, n): low-passed and late, then scaled, then shifted."""
-    # those that no catalogue knows come first
+def _odd_sensor(effects: Sequence[Effect], tau: Array) -> Array:
+    """Torque sensors (m, n) that no catalogue knows."""
     read = tau.copy()
     for effect in effects:
         p: dict[str, Any] = dict(effect.parameters)
@@ -181,6 +172,20 @@ def torque_sensor(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
                 read[:, j] -= np.clip(tau[:, j], -p["w"], p["w"])
             case "x_torque_saturation":
                 read[:, j] = p["s"] * np.tanh(tau[:, j] / p["s"])
+    return read
+
+
+def _low_passed(t: Array, x: Array, d: float, c: float) -> Array:
+    """x (m,) behind 1 / (1 + d s + (d^2 - c) s^2), by its spectrum; constant before the start."""
+    padded = np.pad(x, PAD, mode="linear_ramp", end_values=x[0])
+    s = 2j * np.pi * np.fft.rfftfreq(len(padded), t[1] - t[0])
+    spectrum = np.fft.rfft(padded) / (1 + d * s + (d * d - c) * s**2)
+    return np.fft.irfft(spectrum, len(padded))[PAD:-PAD]
+
+
+def torque_sensor(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
+    """What the torque sensors read (m, n): low-passed and late, then scaled, then shifted."""
+    read = _odd_sensor(effects, tau)
     for effect in (e for e in effects if e.name == "torque_filter"):
         d, c = effect.number("d"), effect.number("c")
         for j in effect.columns(tau.shape[1]):
