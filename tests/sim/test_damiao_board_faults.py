@@ -46,19 +46,6 @@ def struck(name: str) -> tuple[list[list[can.Message]], int]:
     return rows, count
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("fire", "no fault 'fire'; have: drop, deaf"),
-        ("drop=1.5", "a share of frames"),
-        ("silent=8", "number of a motor, from 1 to 7"),
-    ],
-)
-def test_what_cannot_be_is_refused_with_the_choices(text, says) -> None:
-    with pytest.raises(ValueError, match=says):
-        board_faults([text])
-
-
 def test_every_fault_has_a_default_and_a_start() -> None:
     faults = board_faults([f"{name}@2.5" for name in NAMES])
     assert [fault.name for fault in faults.faults] == list(NAMES)
