@@ -318,12 +318,7 @@ class DamiaoArm:
         self._need_open()
         if not self.can_move:
             raise DriverError("this CAN arm may not be moved; allow motion first")
-        push = None if self._guardian is None else self._guardian.memory.forbidden
-        if push is not None:
-            raise DriverError(
-                f"{push.said(self.joint_names[push.joint])}: something holds the arm; the "
-                "guardian process has stopped it"
-            )
+        self._need_leave()
         frames, cut = torque_frames(tau, self._tau_max)
         if cut:
             self.intake.note("cut", "a torque beyond a motor's TMAX was cut")
@@ -346,6 +341,15 @@ class DamiaoArm:
         """
         if np.isfinite(tau).all():
             self._told = np.asarray(tau, dtype=np.float64).tolist()
+
+    def _need_leave(self) -> None:
+        """Raises DriverError where the guardian has forbidden to drive on."""
+        push = None if self._guardian is None else self._guardian.memory.forbidden
+        if push is not None:
+            raise DriverError(
+                f"{push.said(self.joint_names[push.joint])}: something holds the arm; the "
+                "guardian process has stopped it"
+            )
 
     def stop(self) -> None:
         """Brake a driven arm and hold it where it comes to rest; it goes on being held.

@@ -81,10 +81,13 @@ class Bank:
         if bytes(data[:7]) == b"\xff" * 7:
             self.status[j] = {0xFB: 0, 0xFC: 1, 0xFD: 0}.get(data[7], self.status[j])
         else:
-            self.commanded[j] = self.commanded[j] or self.status[j] == 1
-            self.command[j] = decode_command(data, FullScale(*self.encode[j]))
+            self._take(j, data)
         self.heard_ns[j] = now_ns
         return j, self.state(j, now_ns)
+
+    def _take(self, j, data):
+        self.commanded[j] = self.commanded[j] or self.status[j] == 1
+        self.command[j] = decode_command(data, FullScale(*self.encode[j]))
 
     def _service(self, j, data, now_ns):
         if data[2] == 0xCC:

@@ -217,10 +217,7 @@ class Peer:
             if answer[12:13] == b"\0":
                 self._where = ("127.0.0.1", port)
         elif command == MOVE:
-            with self._lock:
-                self._say(MOVE, command_id, bytes([self.first_status]))
-                if self.first_status == STARTED:
-                    self.modes, self._move_id = (RUNNING[self.protocol], 2, 2), command_id
+            self._move(command_id)
         elif command == STOP_MOVE and self.stop_status is not None:
             with self._lock:
                 if self.stop_status == 0:
@@ -238,6 +235,12 @@ class Peer:
                 if self.recover_status == 0:
                     self.modes, self.errors, self.reflex = (0, 3, 1), (), ()
                 self._say(command, command_id, bytes([self.recover_status]))
+
+    def _move(self, command_id: int) -> None:
+        with self._lock:
+            self._say(MOVE, command_id, bytes([self.first_status]))
+            if self.first_status == STARTED:
+                self.modes, self._move_id = (RUNNING[self.protocol], 2, 2), command_id
 
     def _say(self, command: int, command_id: int, payload: bytes) -> None:
         self._put(reply(command, command_id, payload))
