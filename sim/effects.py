@@ -109,8 +109,37 @@ class Effect:
         if self.name not in SPECS:
             raise ValueError(f"no effect {self.name!r}; {choices(self.name, SPECS)}")
         object.__setattr__(self, "joints", tuple(int(j) for j in self.joints))
-        _check_keys(self)
-        _check_joints(self)
+        _, needed, optional = SPECS[self.name]
+        for key in needed:
+            if key not in self.parameters:
+                raise ValueError(f"{self.name} has no {key!r}; needs: {', '.join(needed)}")
+        for key, value in self.parameters.items():
+            if key not in needed + optional:
+                raise ValueError(
+                    f"{self.name} has no parameter {key!r}; {choices(key, needed + optional)}"
+                )
+            shape = (LENGTHS[key],) if key in LENGTHS else ()
+            try:
+                numbers = np.asarray(value, dtype=float)
+            except (TypeError, ValueError):
+                numbers = np.array(np.nan)
+            if numbers.shape != shape or not np.isfinite(numbers).all():
+                raise ValueError(
+                    f"{self.name}: {key} is {value!r}; needs {shape or 'one'} number(s)"
+                )
+        for table, fits in ((POSITIVE, np.greater), (NOT_NEGATIVE, np.greater_equal)):
+            if self.name in table and not fits(self.number(table[self.name]), 0.0):
+                raise ValueError(f"{self.name}: {table[self.name]} is too small")
+        joints = self.joints
+        whole = self.place in (BODY, WRENCH) or self.name in ("signal_delay", "x_wall", "x_floor")
+        if any(j < 1 for j in joints):
+            raise ValueError(f"{self.name} is on joints {list(joints)}; they count from 1")
+        if self.name == "link_inertia" and len(joints) != 1:
+            raise ValueError("link_inertia needs the one joint that moves its link")
+        if self.name in PAIRS and len(joints) != 2:
+            raise ValueError(f"{self.name} needs two joints: [from, to]")
+        if not joints and not whole:
+            raise ValueError(f"{self.name} needs at least one joint")
         if self.interval_s is not None and not self.start_s < self.end_s:
             raise ValueError(f"{self.name}: interval {self.interval_s} ends before it starts")
 
@@ -183,40 +212,3 @@ def payload(
     if inertia is not None:
         numbers["inertia"] = np.asarray(inertia, float)[np.triu_indices(3)].tolist()
     return Effect("payload", (), numbers, None if t_s is None else (t_s, None))
-
-
-def _check_keys(effect: Effect) -> None:
-    """Raises ValueError for missing, unknown, non-finite or impossible parameters."""
-    _, needed, optional = SPECS[effect.name]
-    for key in needed:
-        if key not in effect.parameters:
-            raise ValueError(f"{effect.name} has no {key!r}; needs: {', '.join(needed)}")
-    for key, value in effect.parameters.items():
-        if key not in needed + optional:
-            raise ValueError(
-                f"{effect.name} has no parameter {key!r}; {choices(key, needed + optional)}"
-            )
-        shape = (LENGTHS[key],) if key in LENGTHS else ()
-        try:
-            numbers = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            numbers = np.array(np.nan)
-        if numbers.shape != shape or not np.isfinite(numbers).all():
-            raise ValueError(f"{effect.name}: {key} is {value!r}; needs {shape or 'one'} number(s)")
-    for table, fits in ((POSITIVE, np.greater), (NOT_NEGATIVE, np.greater_equal)):
-        if effect.name in table and not fits(effect.number(table[effect.name]), 0.0):
-            raise ValueError(f"{effect.name}: {table[effect.name]} is too small")
-
-
-def _check_joints(effect: Effect) -> None:
-    """Raises ValueError for a wrong number of joints or joints that do not count from 1."""
-    joints = effect.joints
-    whole = effect.place in (BODY, WRENCH) or effect.name in ("signal_delay", "x_wall", "x_floor")
-    if any(j < 1 for j in joints):
-        raise ValueError(f"{effect.name} is on joints {list(joints)}; they count from 1")
-    if effect.name == "link_inertia" and len(joints) != 1:
-        raise ValueError("link_inertia needs the one joint that moves its link")
-    if effect.name in PAIRS and len(joints) != 2:
-        raise ValueError(f"{effect.name} needs two joints: [from, to]")
-    if not joints and not whole:
-        raise ValueError(f"{effect.name} needs at least one joint")

@@ -29,9 +29,6 @@ from sim.truth import Array, Truth
 PERIOD_S = 1e-3
 SUBSTEPS = 4  # of 0.25 ms
 FORCES = ("fx", "fy", "fz", "mx", "my", "mz")
-# End stops, our choice: a falling arm (50 J) gives them 0.14 rad and comes to rest there.
-STOP_STIFFNESS = 5000.0  # N m/rad
-STOP_DAMPING = 50.0  # N m s/rad
 
 
 class DriveLaw(NamedTuple):
@@ -236,8 +233,9 @@ class Engine:
         middle = dq + self._h / 2 * ddq
         rigid = bias + M @ ddq
         parts = add_up(self._rows, t, q, middle, rigid, self._bent)
-        parts[0] += STOP_STIFFNESS * beyond - self._contact(t, q)
-        parts[1] += STOP_DAMPING * touching
+        # End stops, our choice, N m/rad: a falling arm (50 J) gives them 0.14 rad and rests there.
+        parts[0] += 5000.0 * beyond - self._contact(t, q)
+        parts[1] += 50.0 * touching  # N m s/rad
         if self.obstacles:
             against, damping = self.obstacles.act(t, q, middle, stage.truth.frames)
             parts[0] += against

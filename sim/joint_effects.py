@@ -170,7 +170,6 @@ def step(M: Array, bias: Array, v: Array, h: float, parts: Array, drive: Array) 
 
 
 # Our choice: a joint gives 0.02 rad to 100 N m, a wall 5 mm to 100 N.
-HOLD_STIFFNESS, HOLD_DAMPING = 5000.0, 50.0  # N m/rad, N m s/rad
 WALL_STIFFNESS, WALL_DAMPING = 20000.0, 200.0  # N/m, N s/m
 
 
@@ -208,10 +207,10 @@ class Obstacles:
                 against -= J[:3].T @ push
             else:
                 joints = effect.columns(self._n)
-                k = effect.number("k", HOLD_STIFFNESS)
+                k = effect.number("k", 5000.0)  # N m/rad
                 at, _ = self._places.setdefault(number, (q + effect.number("push") / k, 0.0))
                 against[joints] += k * (q - at)[joints]
-                damping[joints] += HOLD_DAMPING
+                damping[joints] += 50.0  # N m s/rad
         self.torque = -against - damping * dq
         return against, damping
 

@@ -61,16 +61,6 @@ class SensorNoise:
 
     def measure(self, k: int, clean: JointSample) -> JointSample | None:
         """Sample k as it arrives, None where it is lost. To be called for every k in order."""
-        sample = self._noisy(k, clean)
-        if self._levels.repeats or self._levels.dropouts:
-            lost, repeated = self._fate.at(k)
-            if self._last is not None and repeated < self._levels.repeats:
-                sample = replace(self._last, stamp_ns=sample.stamp_ns)
-            self._last = sample
-            return None if lost < self._levels.dropouts else sample
-        return sample
-
-    def _noisy(self, k: int, clean: JointSample) -> JointSample:
         tau, dq, q = self._joints.at(k)
         least = self._levels.tau_at_rest
         if least != 1.0:
@@ -86,7 +76,14 @@ class SensorNoise:
         if self._levels.stamp_jitter_s:
             edge = 0.45 / RATE_HZ  # stamps stay in order
             stamp_ns += round(min(max(float(self._jitter.at(k)), -edge), edge) * 1e9)
-        return JointSample(stamp_ns, clean.q + q, clean.dq + dq, tau, links)
+        sample = JointSample(stamp_ns, clean.q + q, clean.dq + dq, tau, links)
+        if self._levels.repeats or self._levels.dropouts:
+            lost, repeated = self._fate.at(k)
+            if self._last is not None and repeated < self._levels.repeats:
+                sample = replace(self._last, stamp_ns=sample.stamp_ns)
+            self._last = sample
+            return None if lost < self._levels.dropouts else sample
+        return sample
 
 
 class _Stream:
@@ -111,7 +108,16 @@ class _JointNoise:
     """
 
     def __init__(self, levels: NoiseLevels, n: int) -> None:
-        white, band = _torque_parts(levels)
+        # Rms of the white noise and gain of the band noise that add up to the levels. Both have
+        # power in both bands: the white one between 10 and 40 Hz, the band one in its skirts above
+        # 50 Hz. Two linear equations in the two powers.
+        f, response = (x[:-1] for x in band_response())
+        power = np.abs(response) ** 2 / len(f)
+        high, inside = f >= HIGH_HZ, (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
+        shares = np.array([[high.mean(), power[high].sum()], [inside.mean(), power[inside].sum()]])
+        wanted = np.square(np.broadcast_arrays(levels.tau_above_50hz, levels.tau_10_to_40hz))
+        powers = np.linalg.solve(shares, wanted.reshape(2, -1))
+        white, band = np.sqrt(np.maximum(powers, 0.0))
         above = 1.0 - HIGH_HZ / (RATE_HZ / 2)  # share of white noise's power above 50 Hz: 0.9
         whole = 1 / np.sqrt(above)
         dq, q = (whole * np.asarray(x) for x in (levels.dq_above_50hz, levels.q_above_50hz))
@@ -139,18 +145,3 @@ def band_response() -> tuple[Array, NDArray[np.complex128]]:
     f = np.linspace(0.0, RATE_HZ / 2, (1 << 14) + 1)
     sections = butter(2, BAND_HZ, btype="bandpass", fs=RATE_HZ, output="sos")
     return f, np.asarray(sosfreqz(sections, f, fs=RATE_HZ)[1])
-
-
-def _torque_parts(levels: NoiseLevels) -> tuple[Array, Array]:
-    """Rms of the white noise and gain of the band noise that add up to the levels.
-
-    Both parts have power in both bands: the white one between 10 and 40 Hz, the band one in its
-    skirts above 50 Hz. Two linear equations in the two powers.
-    """
-    f, response = (x[:-1] for x in band_response())
-    power = np.abs(response) ** 2 / len(f)
-    high, inside = f >= HIGH_HZ, (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
-    shares = np.array([[high.mean(), power[high].sum()], [inside.mean(), power[inside].sum()]])
-    wanted = np.square(np.broadcast_arrays(levels.tau_above_50hz, levels.tau_10_to_40hz))
-    white, band = np.linalg.solve(shares, wanted.reshape(2, -1))
-    return np.sqrt(np.maximum(white, 0.0)), np.sqrt(np.maximum(band, 0.0))

@@ -65,12 +65,7 @@ def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
     imus = options.get("imus", [])
     if not isinstance(imus, list) or not all(isinstance(x, str) for x in imus):
         raise ValueError(f'{name}: imus is {imus!r}; have: ["LINK", ...]')
-    _check_trouble(options.get("trouble", {}))
-    return numbers
-
-
-def _check_trouble(trouble: Any) -> None:
-    """Raises ValueError, naming the choices."""
+    trouble = options.get("trouble", {})
     if not isinstance(trouble, dict) or not trouble.keys() <= set(TROUBLES):
         raise ValueError(f"trouble is {trouble!r}; have: a table of {', '.join(TROUBLES)}")
     for key in trouble.keys() - {"held", "push"}:
@@ -81,6 +76,7 @@ def _check_trouble(trouble: Any) -> None:
     held = trouble.get("held", [])
     if not isinstance(held, list) or not all(type(j) is int and j > 0 for j in held):
         raise ValueError(f"trouble: held is {held!r}; have: [NUMBER OF A JOINT, ...]")
+    return numbers
 
 
 def options_of(texts: Sequence[str]) -> dict[str, Any]:

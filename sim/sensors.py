@@ -26,8 +26,6 @@ _TORQUE_CHAIN = (
     *("x_torque_crosstalk", "x_torque_saturation", "torque_gain", "torque_offset"),
     "x_torque_deadband",
 )
-W_NOISE, A_NOISE = 1.75e-3, 0.04  # of a reading, rad/s and m/s² rms
-W_BIAS, A_BIAS = np.radians(0.5), 0.2  # at most, rad/s and m/s²
 LATE_TICKS = 6  # at most: a reading's stamp comes after what it measured
 
 
@@ -80,7 +78,8 @@ class Imus:
         turn = axes * np.sign(signs.diagonal())
         turn[:, 0] *= np.linalg.det(turn)
         every = max(round(1.0 / (rng.uniform(*(200.0, 500.0)) * period_s)), 1)
-        w_bias, a_bias = W_BIAS * rng.uniform(-1, 1, 3), A_BIAS * rng.uniform(-1, 1, 3)
+        w_bias = np.radians(0.5) * rng.uniform(-1, 1, 3)  # rad/s
+        a_bias = 0.2 * rng.uniform(-1, 1, 3)  # m/s²
         place, late = 0.05 * rng.standard_normal(3), int(rng.integers(0, LATE_TICKS + 1))  # m
         return Sensor(link, turn, place, w_bias, a_bias, every, late)
 
@@ -99,8 +98,8 @@ class Imus:
             _, w, a, dw = self._past[s.late][s.link]
             felt = a + np.cross(dw, s.place) + np.cross(w, np.cross(w, s.place))
             noise = self._rng.standard_normal((2, 3))
-            twist[s.link, 3:] = w @ s.turn + s.w_bias + W_NOISE * noise[0]
-            accel[s.link, :3] = felt @ s.turn + s.a_bias + A_NOISE * noise[1]
+            twist[s.link, 3:] = w @ s.turn + s.w_bias + 1.75e-3 * noise[0]  # rad/s rms
+            accel[s.link, :3] = felt @ s.turn + s.a_bias + 0.04 * noise[1]  # m/s² rms
         return LinkMotion(twist, accel)
 
 
@@ -217,7 +216,17 @@ class Sensors:
         for name in _TORQUE_CHAIN:
             for effect in self._effects:
                 if effect.name == name and effect.acts(t):
-                    _read(effect, effect.columns(self._n), true, tau)
+                    on, number = effect.columns(self._n), effect.number
+                    if name == "x_torque_crosstalk":
+                        tau[on[1]] += number("share") * true[on[0]]
+                    elif name == "x_torque_saturation":
+                        tau[on] = number("s") * np.tanh(tau[on] / number("s"))
+                    elif name == "torque_gain":
+                        tau[on] *= 1.0 + number("g")
+                    elif name == "torque_offset":
+                        tau[on] += number("o")
+                    else:
+                        tau[on] -= np.clip(tau[on], -number("w"), number("w"))
         for effect, low_pass in self._slow:
             if effect.acts(t):
                 columns = effect.columns(self._n)
@@ -238,18 +247,3 @@ class Sensors:
         part, past, joints = steps - whole, np.array(self._past), np.arange(self._n)
         after = np.minimum(whole + 1, len(past) - 1)
         return np.asarray((1 - part) * past[whole, joints] + part * past[after, joints])
-
-
-def _read(effect: Effect, on: list[int], true: Array, tau: Array) -> None:
-    """Let one effect of `_TORQUE_CHAIN` on these joints change the readings tau (n,)."""
-    name, number = effect.name, effect.number
-    if name == "x_torque_crosstalk":
-        tau[on[1]] += number("share") * true[on[0]]
-    elif name == "x_torque_saturation":
-        tau[on] = number("s") * np.tanh(tau[on] / number("s"))
-    elif name == "torque_gain":
-        tau[on] *= 1.0 + number("g")
-    elif name == "torque_offset":
-        tau[on] += number("o")
-    else:
-        tau[on] -= np.clip(tau[on], -number("w"), number("w"))

@@ -250,21 +250,17 @@ class ExcitationController:
         if model is not None:
             now[4] = sample.tau
             if self.observer is not None and self.observer.learned:
-                self._listen(self.observer)
+                # Expect what the observer does; what its model has newly explained is no offset
+                now[Now.EXPECTED], now[Now.STD] = self.observer.expected, self.observer.std
+                if self.observer.explained is not self._explained:
+                    now[Now.OFFSET] += self.observer.explained - self._explained
+                    self._explained = self.observer.explained
             else:
                 now[5] = model(ref.q, ref.dq, ref.ddq)
             if self._ticks % 20 == 0:  # between two looks at what carries the arm
                 self._tell_weight(model.unbent(ref.q), ref.q)
         self._tau = watch.step(most, 1e-9 * min(step_ns, 2 * self._period_ns))
         return self._tau.copy()
-
-    def _listen(self, observer: ContactObserver) -> None:
-        """Expect what the observer does; what its model has newly explained is no offset."""
-        now = self._watch.now
-        now[Now.EXPECTED], now[Now.STD] = observer.expected, observer.std
-        if observer.explained is not self._explained:
-            now[Now.OFFSET] += observer.explained - self._explained
-            self._explained = observer.explained
 
     def _tell_weight(self, gravity: Array, q: Array) -> None:
         """What carries the arm (n,) N m: kept where the arm adds it, else told where asked for.

@@ -294,7 +294,19 @@ class Designer:
         told, count = self.information, len(table.q)
         samples = self.seconds * told.samples_per_s
         Z, U = told.rows(*motion)
-        value, of_H, of_own = self._value(samples * (Z.T @ Z) / count, U.T @ U / count)
+        # f, and its derivatives by both matrices
+        H = told.prior + samples * (Z.T @ Z) / count
+        if self.known is not None:
+            H = H + self.known
+        C, W, B = np.linalg.inv(H), told.in_wanted_units, U.T @ U / count
+        B = B + 1e-9 * np.trace(B) * np.eye(len(B))  # of joints that stand nothing shows some
+        D = np.linalg.inv(B)
+        even = EVEN if self.known is None else 0.0
+        left, most, least = (float(np.trace(part)) for part in (W @ C, B, D))
+        value = float(np.linalg.slogdet(H)[1]) / len(H) - MIX * np.log(left)
+        value -= even * np.log(most * least)
+        of_H = C / len(H) + (MIX / left) * (C @ W @ C)
+        of_own = even * (D @ D / least - np.eye(len(B)) / most)
         slope = np.zeros_like(x)
 
         G = told.on_rows(samples / count * of_H, of_own / count)
@@ -317,22 +329,6 @@ class Designer:
             value -= NEAR_WEIGHT * short
             slope -= NEAR_WEIGHT * (push.T @ table.q[chosen])
         return value, slope
-
-    def _value(self, brought: Array, inertial: Array) -> tuple[float, Array, Array]:
-        """f, and its derivatives by both matrices."""
-        H = self.information.prior + brought
-        if self.known is not None:
-            H = H + self.known
-        C, W, B = np.linalg.inv(H), self.information.in_wanted_units, inertial
-        B = B + 1e-9 * np.trace(B) * np.eye(len(B))  # of joints that stand nothing shows some
-        D = np.linalg.inv(B)
-        even = EVEN if self.known is None else 0.0
-        left, most, least = (float(np.trace(part)) for part in (W @ C, B, D))
-        value = float(np.linalg.slogdet(H)[1]) / len(H) - MIX * np.log(left)
-        value -= even * np.log(most * least)
-        of_H = C / len(H) + (MIX / left) * (C @ W @ C)
-        of_own = even * (D @ D / least - np.eye(len(B)) / most)
-        return value, of_H, of_own
 
 
 def _harmonics(settings: ExcitationSettings) -> Array:

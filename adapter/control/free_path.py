@@ -114,7 +114,18 @@ class ArmInCell:
         for name in (name for pair in cell.allowed for name in pair):
             if name not in names:
                 raise SettingsError(f"cell.allowed: no '{name}'; have: {', '.join(sorted(names))}")
-        self.ignored = self._joined()
+        # Pairs of links that are near in nearly every pose, whatever the joints do
+        rng, limits = np.random.default_rng(0), self.model.limits
+        low = np.where(np.isfinite(limits.lower), limits.lower, -np.pi)
+        high = np.where(np.isfinite(limits.upper), limits.upper, np.pi)
+        own = [pair for pair in self._pairs if pair.other is not None]
+        near = np.zeros(len(own))
+        for _ in range(POSES):
+            place_frames(self._frames, rng.uniform(low, high), self._R, self._o)
+            near += [self._distance(pair) < self.cell.margin for pair in own]
+        self.ignored = [
+            p.names for p, count in zip(own, near, strict=True) if count > ALWAYS * POSES
+        ]
         allowed = {frozenset(pair) for pair in (*cell.allowed, *self.ignored)}
         self._pairs = [pair for pair in self._pairs if frozenset(pair.names) not in allowed]
 
@@ -320,18 +331,6 @@ class ArmInCell:
             link = self.model.tree.parent[link]
             levers[link] = far
         return levers
-
-    def _joined(self) -> list[tuple[str, str]]:
-        """Pairs of links that are near in nearly every pose, whatever the joints do."""
-        rng, limits = np.random.default_rng(0), self.model.limits
-        low = np.where(np.isfinite(limits.lower), limits.lower, -np.pi)
-        high = np.where(np.isfinite(limits.upper), limits.upper, np.pi)
-        own = [pair for pair in self._pairs if pair.other is not None]
-        near = np.zeros(len(own))
-        for _ in range(POSES):
-            place_frames(self._frames, rng.uniform(low, high), self._R, self._o)
-            near += [self._distance(pair) < self.cell.margin for pair in own]
-        return [p.names for p, count in zip(own, near, strict=True) if count > ALWAYS * POSES]
 
 
 class FreeMotion:

@@ -144,8 +144,16 @@ class Information:
         std = np.linalg.norm(believed @ axes / np.sqrt(1.0 + np.maximum(gained, 0.0)), axis=1)
         before = np.linalg.norm(believed, axis=1)
         exists = np.linalg.norm(shown, axis=1) > 1e-9 * self.size  # less is not shown
-        names, units = self._names()
-        return Expected(names, units, std, share * self.size, exists & (std < 0.5 * before))
+        tree, names = self._model.tree, list[str]()
+        units: list[str] = []
+        for link in tree.link_names:
+            names += [f"{link} {part}" for part in PARAMETERS]
+            units += UNITS
+        for effect in self._effects:
+            names += [f"{joint} {effect.key}" for joint in tree.joint_names]
+            units += [of_sliding(effect.unit) if slides else effect.unit for slides in tree.slides]
+        known = exists & (std < 0.5 * before)
+        return Expected(tuple(names), tuple(units), std, share * self.size, known)
 
     def condition(self, q: Array, dq: Array, ddq: Array) -> float:
         """Condition number of a table's regressor of the base parameters, inertias alone."""
@@ -172,14 +180,3 @@ class Information:
             for j in range(n):
                 out[:, j, k * n + j] = column[:, j]
         return out
-
-    def _names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        tree, names = self._model.tree, list[str]()
-        units: list[str] = []
-        for link in tree.link_names:
-            names += [f"{link} {part}" for part in PARAMETERS]
-            units += UNITS
-        for effect in self._effects:
-            names += [f"{joint} {effect.key}" for joint in tree.joint_names]
-            units += [of_sliding(effect.unit) if slides else effect.unit for slides in tree.slides]
-        return tuple(names), tuple(units)

@@ -13,10 +13,6 @@ from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
 from drivers.interface import Driver
 
-# Of an arm whose documentation is silent; modest: rad/s, rad/s², rad/s³, N m/s. Of what slides the
-# same on a drum of 0.1 m: m/s, m/s², m/s³.
-UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK = 1.0, 5.0, 1000.0
-
 
 @dataclass(frozen=True)
 class MotionLimits:
@@ -58,9 +54,9 @@ class MotionLimits:
         return cls(
             limits.lower,
             limits.upper,
-            np.where(np.isfinite(limits.velocity), limits.velocity, UNKNOWN_VELOCITY * modest),
-            UNKNOWN_ACCELERATION * modest if known is None else known.acceleration,
-            UNKNOWN_JERK * modest if known is None else known.jerk,
+            np.where(np.isfinite(limits.velocity), limits.velocity, 1.0 * modest),
+            5.0 * modest if known is None else known.acceleration,
+            1000.0 * modest if known is None else known.jerk,
             np.where(np.isfinite(limits.effort), limits.effort, np.inf),
             np.full(n, 1000.0) if known is None else known.torque_rate,  # N m/s
             known,

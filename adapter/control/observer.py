@@ -37,12 +37,9 @@ POLE = 2.0 * math.pi * 24.0  # rad/s, of each of the observer's two
 # has to fall below half of that until the contact is over.
 SIGMAS, HOLD_S = 8.0, 0.1
 SLOW_S, NOISE_S = 0.3, 5.0  # what is slower is no noise; over which noise is measured
-AGO_NS, LONG_AGO_S = 15_000_000, 0.1  # readings before, between which a momentum's rate is taken
 WARM_UP_S = 1.0  # of noise before the first contact is believed
 CLIP = 3.0  # standard deviations that count at most where noise is measured
 TURN_DQ, TURN_SHARE = 0.03, 0.3  # rad/s; share of friction that is unknown at a slower joint
-# Of an arm that nobody learned: shares of the effort limit and of the torque that carries it.
-UNLEARNED_EFFORT, UNLEARNED_WEIGHT = 0.02, 0.05
 NOT_KNOWN = np.array([100.0, 100.0, 100.0, 30.0, 30.0, 30.0])  # std of a wrench, N, N m
 MOST_CONTACTS = 1000
 SEEN, SEEN_EVERY = 60, 5  # samples of a contact that are kept to tell what it is
@@ -222,7 +219,7 @@ def observe_each(bodies, joints, table, readings, step, past):
                     known = table[Of.TAU.value, j] + table[Of.TORQUE.value, j]
                     table[Of.EXPECTED.value, j] = known
         anew, stamp, age_s = False, stamps[i], older_s
-        if stamp - past_ns[1] > AGO_NS:
+        if stamp - past_ns[1] > 15_000_000:  # between two a momentum's rate is taken
             past_ns[0], before[0] = past_ns[1], before[1]
             past_ns[1], before[1] = stamp, table[: Of.TAU.value]
         if dt_s < math.inf:
@@ -331,12 +328,10 @@ class ContactObserver:
         self._q, self._dq, self._tau = self._signals[0]
         table[Of.SPIKE] = 0.01 * effort  # s: the momentum that one reading may be off by
         effort = np.where(np.isfinite(effort), effort, 0.0)
-        table[Of.ERROR], table[Of.WEIGHT] = UNLEARNED_EFFORT * effort, UNLEARNED_WEIGHT
+        # not learned yet: shares of the effort limit and of the torque that carries it
+        table[Of.ERROR], table[Of.WEIGHT] = 0.02 * effort, 0.05
         self._take_over()
-        self._compile()
-
-    def _compile(self) -> None:
-        """Compile what a step calls, on numbers of no meaning: the loop has no time for it."""
+        # Compile what a step calls, on numbers of no meaning: the loop has no time for it
         n = len(self.std)
         table, one = np.ones_like(self._table), np.ones(n)
         table[Of.NOISE :] = np.eye(n)
@@ -367,21 +362,16 @@ class ContactObserver:
         self._table[Of.ERROR], self._table[Of.WEIGHT] = torque_std, 0.0
         self._take_over()
         if not self._anew:
-            self._explain(self._ask_twice() - before)
+            # Go on from the change of momentum and drift, now and a little before. A fresh start
+            # from one noisy reading would look like a push, and so would a torque that is taken
+            # for an external one only until the observer has followed.
+            now, then = self._ask_twice() - before
+            dt_s = 1e-9 * float(self._stamp_ns - self._past[0][0])
+            gone = now[1] - ((now[0] - then[0]) / dt_s if 0.0 < dt_s < 0.1 else 0.0)
+            self._table[[Of.MOMENTUM, Of.RATE]] += now
+            self._table[[Of.TORQUE, Of.SLOW, Of.EXPECTED]] -= gone
+            self.explained = self.explained + gone
         return True
-
-    def _explain(self, change: Array) -> None:
-        """Go on from a change (2, 2, n) of momentum and drift, now and a little before.
-
-        A fresh start from one noisy reading would look like a push, and so would a torque that is
-        taken for an external one only until the observer has followed.
-        """
-        now, then = change
-        dt_s = 1e-9 * float(self._stamp_ns - self._past[0][0])
-        gone = now[1] - ((now[0] - then[0]) / dt_s if 0.0 < dt_s < LONG_AGO_S else 0.0)
-        self._table[[Of.MOMENTUM, Of.RATE]] += now
-        self._table[[Of.TORQUE, Of.SLOW, Of.EXPECTED]] -= gone
-        self.explained = self.explained + gone
 
     def _ask_twice(self) -> Array:
         """(2, 2, n) momentum and drift by the model in use, now and a little before."""

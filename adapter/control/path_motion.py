@@ -29,10 +29,6 @@ from drivers.errors import choices
 
 UNKNOWN_RANGE = 0.5  # rad to each side, of a joint whose range nobody documented
 
-# Largest slope and second derivative of the quintic step over one second, and of the product of
-# two that overlap (a stop during the stop before a rest).
-RAMP_SLOPE, RAMP_BEND = 2.4, 12.4
-
 
 @jit
 def smooth_step(x):
@@ -190,7 +186,9 @@ def ramped(
     and c1, c2 those of the ramps.
     """
     ramp = min(settings.start_s, settings.stop_s)
-    c1, c2 = RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
+    # Largest slope and second derivative of the quintic step over one second, and of the product
+    # of two that overlap (a stop during the stop before a rest).
+    c1, c2 = 2.4 / ramp, 12.4 / ramp**2
     return speed, acceleration + c1 * speed, jerk + 3.0 * c1 * acceleration + c2 * speed
 
 

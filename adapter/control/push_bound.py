@@ -14,7 +14,6 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import frames_of, place_frames
 
 POSES, DIRECTIONS = 40, 200  # that are looked at
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # spreads directions evenly over a sphere
 # Of the effort limit, and N m: what a stopped arm may still push with on each joint. A CAN arm is
 # carried with a tenth of it beyond its weight (`resting`); half of that for what it sags by.
 LEFT_SHARE, LEFT_LEAST = 0.15, 1.0
@@ -63,7 +62,8 @@ def push_bound(
     frames, n = frames_of(model.tree, model.lam), model.tree.n
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
     z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
-    angle, radius, forces = GOLDEN_ANGLE * np.arange(DIRECTIONS), np.sqrt(1.0 - z**2), []
+    golden = np.pi * (3.0 - np.sqrt(5.0))  # spreads them evenly over a sphere
+    angle, radius, forces = golden * np.arange(DIRECTIONS), np.sqrt(1.0 - z**2), []
     ways = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
     for s in np.linspace(0.0, 30.0, POSES):  # of path
         place_frames(frames, motion.path(s)[0], R, o)

@@ -22,8 +22,6 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 
-BAND_SHARE, LEAST_BAND = 0.1, 0.5  # of the effort limit, and N m: friction, offsets, model error
-
 
 def check_resting_torque(model: SelfModel, q: Array, tau: Array) -> None:
     """Refuse an arm at rest that does not hold what its model says.
@@ -61,7 +59,8 @@ class CarriedWeight:
     def __init__(self, model: SelfModel, trusted: bool = False) -> None:
         effort = np.where(np.isfinite(model.limits.effort), model.limits.effort, 0.0)
         self._model, self._plain = model, ModelFeedforward.of(model)
-        self._band = np.maximum(BAND_SHARE * effort, LEAST_BAND)
+        # N m: friction, offsets, model error
+        self._band = np.maximum(0.1 * effort, 0.5)
         self._heaviest = 1 / 3 * float(model.theta[:, 0].sum())  # that a hand may carry unsaid
         self._loaded, self._trusted = self._plain, trusted
         self._more = np.zeros(len(effort))

@@ -82,9 +82,6 @@ class ExcitationSettings:
         for begin, end in self.rests:
             if end - begin < self.stop_s:
                 raise SettingsError(f"excitation.rests: {begin} to {end} s is shorter than a stop")
-        self._check_slow_start()
-
-    def _check_slow_start(self) -> None:
         if not 0.0 < self.slow_share <= 1.0:
             raise SettingsError("excitation.slow_share must be above 0 and at most 1")
         if not (self.slow_s == 0.0 or self.start_s <= self.slow_s < math.inf):

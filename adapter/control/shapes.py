@@ -71,7 +71,14 @@ def read_mesh(path: str | Path, scale: tuple[float, ...] = (1.0,)) -> Mesh:
         else:
             raise ValueError(f"meshes are read from {FORMATS}; convert it")
         corners = corners * np.asarray(scale, dtype=np.float64)
-        _check(corners, triangles)
+        if not len(triangles):
+            raise ValueError("has no triangles")
+        if triangles.min() < 0 or triangles.max() >= len(corners):
+            raise ValueError("a triangle has a corner that the file does not have")
+        if not np.isfinite(corners).all():
+            raise ValueError("a corner is not a finite number")
+        if (far := float(np.abs(corners).max())) > 100.0:  # m
+            raise ValueError(f"is {far:g} m large; a scale of 0.001 makes metres of millimetres")
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:
@@ -128,17 +135,6 @@ def _inside(found: Path, root: Path, name: str) -> Path:
     if not found.is_relative_to(root):
         raise ValueError(f"{name}: lies outside of {root}; it is not read")
     return found
-
-
-def _check(corners: Array, triangles: NDArray[np.int64]) -> None:
-    if not len(triangles):
-        raise ValueError("has no triangles")
-    if triangles.min() < 0 or triangles.max() >= len(corners):
-        raise ValueError("a triangle has a corner that the file does not have")
-    if not np.isfinite(corners).all():
-        raise ValueError("a corner is not a finite number")
-    if (far := float(np.abs(corners).max())) > 100.0:  # m
-        raise ValueError(f"is {far:g} m large; a scale of 0.001 makes metres of millimetres")
 
 
 def _stl(content: bytes) -> tuple[Array, NDArray[np.int64]]:

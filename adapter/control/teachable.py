@@ -113,22 +113,19 @@ def _smoothed(log: Log) -> tuple[list[Array], float]:
     holes = np.flatnonzero(np.diff(seconds) > HOLE_PERIODS * period_s) + 1
     for part in np.split(np.arange(len(stamps)), holes):
         if len(part) >= SHORTEST:
-            table = _stretch(seconds[part], q[part], tau[part], period_s, cutoff_hz)
+            # On an even grid, all smoothed alike
+            t = seconds[part]
+            grid = np.arange(t[0], t[-1], period_s)
+            sections = butter(2, cutoff_hz, fs=1.0 / period_s, output="sos")
+            smooth = []
+            for signal in (q[part], tau[part]):
+                even = np.column_stack([np.interp(grid, t, x) for x in signal.T])
+                smooth.append(sosfiltfilt(sections, even, axis=0))
+            dq = np.gradient(smooth[0], period_s, axis=0)
+            table = [smooth[0], dq, np.gradient(dq, period_s, axis=0), smooth[1]]
             found.append([x[::every] for x in table])
     if not found:
         raise DriverError(f"{log.path}: no {SHORTEST} samples follow each other without a hole")
     whole = [np.concatenate(x) for x in zip(*found, strict=True)]
     moving = (np.abs(whole[1]) > RESTS).any(axis=1)
     return whole, float(moving.sum()) * every * period_s
-
-
-def _stretch(t: Array, q: Array, tau: Array, period_s: float, cutoff_hz: float) -> list[Array]:
-    """On an even grid, all smoothed alike."""
-    grid = np.arange(t[0], t[-1], period_s)
-    sections = butter(2, cutoff_hz, fs=1.0 / period_s, output="sos")
-    smooth = []
-    for signal in (q, tau):
-        even = np.column_stack([np.interp(grid, t, x) for x in signal.T])
-        smooth.append(sosfiltfilt(sections, even, axis=0))
-    dq = np.gradient(smooth[0], period_s, axis=0)
-    return [smooth[0], dq, np.gradient(dq, period_s, axis=0), smooth[1]]

@@ -113,7 +113,6 @@ class FollowingObserver(EstimateFollower):
         return external
 
 
-LOAD_SHARE, LOAD_OFF_M = 0.25, 0.15  # of the arm's own mass, at the last link; off its origin
 FADE_CALLS = 500  # one in each tick
 
 
@@ -129,8 +128,8 @@ class FeedforwardBound:
         self.model = model
         n, tree = documented.tree.n, documented.tree
         effort = np.where(np.isfinite(documented.limits.effort), documented.limits.effort, 0.0)
-        mass = LOAD_SHARE * float(documented.theta[:, 0].sum())
-        reach = mass * LOAD_OFF_M * float(np.linalg.norm(documented.gravity))
+        mass = 0.25 * float(documented.theta[:, 0].sum())
+        reach = mass * 0.15 * float(np.linalg.norm(documented.gravity))
         self._friction = 0.1 * effort + reach  # of the effort limit
         load = np.zeros((n, 10))
         load[-1, 0] = mass

@@ -26,7 +26,6 @@ from drivers.process import StopSignals
 
 WALL_SHARE, WALL_EXTRA_S = 1.1, 2.0  # a run whose stamps stand still ends by the clock on the wall
 WARM_UP_REACH, WARM_UP_RATE = 0.02, 10.0  # rad, rad/s
-HUNG_UP = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,8 @@ class Deadman:
             return True
         if self._poll is None:
             return False
-        return any(event & HUNG_UP for _, event in self._poll.poll(0))
+        hung_up = select.POLLHUP | select.POLLERR | select.POLLNVAL
+        return any(event & hung_up for _, event in self._poll.poll(0))
 
 
 def run_live(

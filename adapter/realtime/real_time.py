@@ -15,8 +15,6 @@ from contextlib import ExitStack
 
 from drivers.process import Answer, pin, quiet_collector, request_fifo, sleep_until
 
-MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
-
 
 def split_cores(allowed: Sequence[int] | None = None) -> tuple[set[int], set[int]]:
     """Cores of the loop (the last one allowed) and of the workers (the others, if any)."""
@@ -57,7 +55,7 @@ def lock_memory() -> Answer:
     unlimited = os.geteuid() == 0 or (
         resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     )
-    flags = MCL_CURRENT | (MCL_FUTURE if unlimited else 0)
+    flags = 3 if unlimited else 1  # MCL_CURRENT and MCL_FUTURE of <sys/mman.h>
     if libc.mlockall(flags) != 0:
         reason = os.strerror(ctypes.get_errno())
         why = "needs root, CAP_IPC_LOCK or a memlock limit (ulimit -l)"

@@ -18,8 +18,6 @@ from adapter.realtime.following import FollowingObserver
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
-CATCH_UP_READS, FRESH_READS = 5000, 3  # at most, and at least: a driver may look one tick back
-
 
 class Ended(StrEnum):
     """Why a run came to its end."""
@@ -122,12 +120,12 @@ class Session:
         if not driver.arrived_ns:
             return
         self._ready_sample = None
-        for k in range(CATCH_UP_READS):
+        for k in range(5000):
             self._let_pass()
             driver.read()
             self.set_aside += 1
             new = time.monotonic_ns() - driver.arrived_ns < 2 * driver.period_ns
-            if new and k >= FRESH_READS:
+            if new and k >= 3:  # a driver may look one tick back
                 return
 
     def tick(self) -> bool:

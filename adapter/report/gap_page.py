@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -195,7 +194,15 @@ def _left(result: GapResult) -> Check:
 
 def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
     """What to measure next, and what the new model is for."""
-    asked = _asked(result.what_next)
+    # Experiments, each motion once with all that it tells: "move so: this stays, that grows"
+    told: dict[str, dict[str, None]] = {}
+    for text in result.what_next:
+        motion, _, signs = text.partition(": ")
+        told.setdefault(motion, {}).update(dict.fromkeys(filter(None, signs.split(", the "))))
+    asked = []
+    for motion, clauses in told.items():
+        signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
+        asked.append(tables.tied(capital(f"{motion}: the {signs}" if signs else motion)))
     figures = FIGURES if folder is None else str(folder / FIGURES)
     steps = [Step(text) for text in asked]
     if asked and result.findings:
@@ -217,19 +224,6 @@ def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
         why = "Use it in a simulator or planner: the robot's file with what was found"
         steps.append(Step(why, command("export", out, "--urdf", "learned.urdf")))
     return steps
-
-
-def _asked(texts: Sequence[str]) -> list[str]:
-    """Experiments, each motion once with all that it tells: "move so: this stays, that grows"."""
-    told: dict[str, dict[str, None]] = {}
-    for text in texts:
-        motion, _, signs = text.partition(": ")
-        told.setdefault(motion, {}).update(dict.fromkeys(filter(None, signs.split(", the "))))
-    found = []
-    for motion, clauses in told.items():
-        signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
-        found.append(tables.tied(capital(f"{motion}: the {signs}" if signs else motion)))
-    return found
 
 
 def _robot(result: GapResult) -> tuple[str, ...]:

@@ -74,6 +74,8 @@ def _any(values: Array) -> bool:
 
 def fall_drawing(before: Array, after: Array, noise: Array | None, names: Sequence[str]) -> Drawing:
     """A line per joint from its error before to that after, on a logarithmic scale."""
+    from matplotlib.ticker import FixedLocator
+
     drawing = Drawing("half")
     ax = drawing.axes[0]
     ax.set_yscale("log")
@@ -88,17 +90,8 @@ def fall_drawing(before: Array, after: Array, noise: Array | None, names: Sequen
         if np.isfinite(last) and last > 0.0:
             ax.plot([j, j], [first, last], color=GRID, linewidth=2.5, zorder=1)
             ax.plot([j], [last], "o", color=ACCENT, markersize=5, gid=named(f"{name}, after"))
-    _log_scale(ax, [before, after, *([] if noise is None else [noise])])
-    categories(ax, [str(j + 1) for j in range(len(before))])
-    drawing.named_x = True
-    time_axis(drawing, "joint")
-    return drawing
-
-
-def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
-    """Limits that hold everything, and ticks at 1, 2 and 5 times powers of ten."""
-    from matplotlib.ticker import FixedLocator
-
+    # limits that hold everything, and ticks at 1, 2 and 5 times powers of ten
+    tables = [before, after] if noise is None else [before, after, noise]
     values = np.concatenate([np.asarray(x, dtype=float) for x in tables])
     values = values[np.isfinite(values) & (values > 0.0)]
     low, high = values.min() / 1.5, values.max() * 1.5
@@ -107,6 +100,10 @@ def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     ticks = [s * 10.0**p for p in powers for s in ((1.0,) if wide else (1.0, 2.0, 5.0))]
     ax.set_ylim(low, high)
     log_ticks(ax.yaxis, FixedLocator([t for t in ticks if low <= t <= high]), power_of_ten)
+    categories(ax, [str(j + 1) for j in range(len(before))])
+    drawing.named_x = True
+    time_axis(drawing, "joint")
+    return drawing
 
 
 def shown_joints(result: GapResult) -> list[int]:
@@ -153,7 +150,14 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
             cloud = _clouds(result, j, x, ("before", "after"), label)
             laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
             for finding in laws:
-                _law(cloud.axes[0], finding)
+                # A law over its signal, with twice its doubt
+                ax = cloud.axes[0]
+                assert finding.curve is not None
+                x, y, std = (
+                    np.asarray(finding.curve[key]) for key in ("at", "torque_nm", "std_nm")
+                )
+                ax.fill_between(x, y - 2.0 * std, y + 2.0 * std, color=INK, alpha=0.2, linewidth=0)
+                ax.plot(x, y, color=INK, linewidth=1.0, linestyle=(0, (4, 2)))
             called = ", ".join(f.title for f in laws)
             clouds.append(cloud.panel(title, result.unit("N m", j), called))
         said = []
@@ -190,14 +194,6 @@ def _follows_alone(finding: Finding, key: str) -> bool:
     """Whether it is a law of one signal of its own joint."""
     law = KNOWN.get(finding.effect)
     return isinstance(law, OverSignals) and not law.by and law.variables == {key}
-
-
-def _law(ax: Axes, finding: Finding) -> None:
-    """A law over its signal, with twice its doubt."""
-    assert finding.curve is not None
-    x, y, std = (np.asarray(finding.curve[key]) for key in ("at", "torque_nm", "std_nm"))
-    ax.fill_between(x, y - 2.0 * std, y + 2.0 * std, color=INK, alpha=0.2, linewidth=0)
-    ax.plot(x, y, color=INK, linewidth=1.0, linestyle=(0, (4, 2)))
 
 
 def _limits(ax: Axes, x: Array, ys: Sequence[Array]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -41,8 +41,6 @@ from adapter.runs.score import (
     trailing_rms,
 )
 
-DASHES: Sequence[tuple[float, Sequence[float]]] = ((0, ()), (0, (4, 1.5)), (0, (1, 1.3)))  # x, y, z
-SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time to converge
 FIRST_S = 0.05  # left end of a logarithmic time axis
 LOWEST = 1e-5  # rad, m; of an error that is shown; below it a line leaves the panel
 SETTLED = "inside both goals"
@@ -62,7 +60,7 @@ def schema_panels(data: RunData) -> list[Panel]:
         return []
     converged = data.converged_s("lambda")
     # most happens at first: values are shown up to here, errors to the end
-    until = t[-1] if converged is None else min(t[-1], max(SHOWN_S, SHOWN_FACTOR * converged))
+    until = t[-1] if converged is None else min(t[-1], max(3.0, 2.5 * converged))
     early, values = thin_rows(t[t <= until], lam[t <= until])
     shown = "" if until == t[-1] else f"; the first {until:.2g} of {t[-1]:.3g} s"
     note = f"in its parent's, x solid, y dashed, z dotted{shown}"
@@ -79,7 +77,17 @@ def schema_panels(data: RunData) -> list[Panel]:
     goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")
     titles = "Orientation error", "Position error"
     for title, error, (goal, unit) in zip(titles, data.schema_errors, goals, strict=True):
-        drawing = _errors(t, error, goal, unit, converged)
+        drawing = Drawing("half")
+        ax = drawing.axes[0]
+        top = max(float(error.max()), 10 * goal)
+        right = t >= FIRST_S
+        lines_by_joint(ax, t[right], np.maximum(error[right], 1e-3 * LOWEST))
+        log_axis(ax, LOWEST, 2 * top)
+        log_time(ax, FIRST_S, t[-1])
+        late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
+        level(ax, goal, f"goal {goal:g} {unit}", left=late)
+        mark(ax, converged, SETTLED)
+        time_axis(drawing)
         panels.append(drawing.panel(title, unit, "in what the data had shown by then"))
     return panels
 
@@ -104,28 +112,12 @@ def _components(t: Array, values: Array, converged: float | None) -> Drawing:
     drawing = Drawing("half")
     ax = drawing.axes[0]
     for j in range(values.shape[1]):
-        for axis, dashes in enumerate(DASHES):
+        for axis, dashes in enumerate([(0, ()), (0, (4, 1.5)), (0, (1, 1.3))]):  # x, y, z
             name = named(f"joint {j + 1} {'xyz'[axis]}")
             (line,) = ax.plot(t, values[:, j, axis], gid=name, color=joint_color(j), linewidth=1.0)
             line.set_linestyle(dashes)
     ax.set_xlim(min(0.0, t[0]), t[-1])
     ax.margins(y=0.12)  # room for the words of the mark
-    mark(ax, converged, SETTLED)
-    time_axis(drawing)
-    return drawing
-
-
-def _errors(t: Array, error: Array, goal: float, unit: str, converged: float | None) -> Drawing:
-    """Errors (k, n) on logarithmic axes, with their goal."""
-    drawing = Drawing("half")
-    ax = drawing.axes[0]
-    top = max(float(error.max()), 10 * goal)
-    shown = t >= FIRST_S
-    lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST))
-    log_axis(ax, LOWEST, 2 * top)
-    log_time(ax, FIRST_S, t[-1])
-    late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
-    level(ax, goal, f"goal {goal:g} {unit}", left=late)
     mark(ax, converged, SETTLED)
     time_axis(drawing)
     return drawing

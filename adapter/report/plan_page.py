@@ -22,7 +22,6 @@ from adapter.report.skeleton import Projection, from_a_corner, ground
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
 
 POSES = 80  # drawn along the path
-GOLDEN = 0.618034  # spreads them over the path without a step that a period could share
 RIM = 24  # corners of a circle
 VIEWS: tuple[tuple[str, Projection, str], ...] = (
     ("Seen from a corner", from_a_corner, "grey: where links go; blue: start; orange: nearest"),
@@ -51,7 +50,8 @@ class Plan(NamedTuple):
         arm, motion, limits, nearest = self
         start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
         span_s = max(nearest.path_s, 30.0)
-        poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
+        # the golden section spreads them without a step that a period could share
+        poses = [motion.path(span_s * (k * 0.618034 % 1.0))[0].copy() for k in range(POSES)]
         names, margin = arm.model.tree.joint_names, arm.cell.margin
         of_joints = [line for line in lines if line.startswith(names)]
         context: dict[str, Any] = {

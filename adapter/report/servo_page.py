@@ -22,7 +22,6 @@ from adapter.report.trust import GOOD, LOOK, Check
 from adapter.report.words import arrow, capital
 
 SHARE, CLOSE_MRAD = 0.25, 4.0  # of the error before; or so small: the joint is explained
-SLOW_RAD_S, MOSTLY = 0.1, 0.5  # where more than that share of what is left is
 
 
 def render_servo_page(
@@ -169,7 +168,7 @@ def _steps(gap: ServoGap, model: str, servos: Path) -> list[Step]:
     if gap.ground.root > gap.servos.ground.root == 0.0:
         steps.append(Step("Record a second motion that touches the table, or none that does"))
     left = _unexplained(gap)
-    slow = [j + 1 for j in left if _share_slow(gap, j) > MOSTLY]
+    slow = [j + 1 for j in left if _share_slow(gap, j) > 0.5]
     fast = [j + 1 for j in left if j + 1 not in slow]
     rest = "what is left is where it is"
     for joints, why in (
@@ -193,6 +192,6 @@ def _share_slow(gap: ServoGap, j: int) -> float:
     slow, whole = 0.0, 0.0
     for _, x in gap.curves:
         squares = (x.after[:, j] - x.measured[:, j]) ** 2
-        still = np.abs(np.gradient(x.after[:, j], x.t)) < SLOW_RAD_S
+        still = np.abs(np.gradient(x.after[:, j], x.t)) < 0.1  # rad/s
         slow, whole = slow + float(squares[still].sum()), whole + float(squares.sum())
     return slow / max(whole, 1e-30)

@@ -21,7 +21,6 @@ from adapter.report.learned_panels import theta_started
 from adapter.report.words import REFUSALS, count, number, with_doubt
 from adapter.runs.run_folder import RunData
 
-LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 HIDDEN = 1e-6  # a share below it is none
 
@@ -156,7 +155,8 @@ def schema_matrix(data: RunData) -> Matrix:
     rank = data.figures["lambda"].get("identifiable_rank")
     pairs = zip(names, data.lam_shown, std, strict=True)
     rows = [(name, list(map(_cell, shown, own, LAMBDA_UNITS))) for name, shown, own in pairs]
-    return Matrix("Body schema λ", f"{rank} of {6 * data.n} directions", LAMBDA_NAMES, rows)
+    names = tuple(f"{way} {axis}" for way in ("turn", "shift") for axis in "xyz")
+    return Matrix("Body schema λ", f"{rank} of {6 * data.n} directions", names, rows)
 
 
 def theta_matrix(data: RunData) -> Matrix:

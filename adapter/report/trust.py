@@ -40,7 +40,6 @@ from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, counted_from
 from adapter.signals.validation import rms_of
 
-MOVED_M = 1e-4  # of the hand, from which a measured λ is said to differ from the documentation
 MANY_LOADS = 3
 
 
@@ -140,7 +139,7 @@ def _hand(data: RunData, worth: Worth) -> list[str]:
             f", each joint's frame known to {quantity(1e3 * max(turn), 'mrad', 2)} and "
             f"{quantity(1e3 * max(shift), 'mm', 2)} (one standard deviation, worst joint)"
         )
-    if worth.hand_m < MOVED_M:
+    if worth.hand_m < 1e-4:
         return [f"The joints are where the documentation puts them{known}."]
     return [
         f"The arm is not built as documented: its hand stands "
@@ -165,7 +164,6 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
 
 GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
 LEFT = "Torque not explained"
-FEW_MISSED, MANY_MISSED = 1e-3, 1e-2  # shares of all deadlines
 
 
 @dataclass(frozen=True)
@@ -329,8 +327,8 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
             f"{quantity(plant.get('p99'), 'µs')}, which waits where it is late: nothing is lost"
         )
     share = missed / deadlines
-    bad = share >= MANY_MISSED and not is_simulated(figures)
-    verdict = GOOD if share < FEW_MISSED else BAD if bad else LOOK
+    bad = share >= 1e-2 and not is_simulated(figures)
+    verdict = GOOD if share < 1e-3 else BAD if bad else LOOK
     return Check(verdict, "Timing", said)
 
 

@@ -32,7 +32,6 @@ SETTLED, PARTS, MOST_TAKEN = 100, 2000, 50
 FIRST_STEPS, FIRST_RATE = 2000, 1.75
 GAIN_STEPS, GAIN, FEW_STEPS = 40, 0.003, 4
 # (steps, share of the usual rate) at the end, at most so many times, to the optimum
-THETA_POLISH, POLISHES = ((250, 1.0), (250, 0.3)), 8
 PER_SAMPLE = 10  # states taken for each independent one
 TRIPLES, APART = 2000, 8  # of neighbouring states, which tell the noise; at first so many apart
 
@@ -71,8 +70,8 @@ def learn_batch(
     learner.start_theta(stamp_of(waiting.rows.rows(0, 1)[0]))
     learner.take_every(waiting.every, waiting.triples)
     _learn_theta(learner, waiting, every, progress)
-    for _ in range(POLISHES):
-        for steps, share in THETA_POLISH:
+    for _ in range(8):
+        for steps, share in ((250, 1.0), (250, 0.3)):
             learner.adam.rate = share * learner.settings.theta.rate
             learner.learn_theta(_NO_STATES, steps)
             learner.theta.adapt_prior(None if learner.rates is None else learner.rates.noise)

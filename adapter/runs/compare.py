@@ -25,7 +25,6 @@ from adapter.physics.kernels import frames_of, place_frames
 
 MOTION_S, STEP_S, EVERY = 8.0, 1e-3, 20  # motion that torques are compared on; rows between poses
 SINES, BAND_HZ = 5, (0.1, 0.6)
-FREE_RAD, FREE_RAD_S = 1.5, 1.0  # of a joint whose limits nobody knows
 SHARE = 0.45  # of the range and of the documented speed
 SAME = 1e-9  # of a number's size, rad and m: rounding
 HIDDEN = 1e-3  # share of a difference that data could show, below which none could
@@ -196,8 +195,8 @@ def _motion(model: SelfModel, seed: int) -> tuple[Array, Array, Array, Array]:
     limits, n = model.limits, model.tree.n
     bounded = limits.upper > limits.lower  # False where unknown
     middle = np.where(bounded, 0.5 * (limits.upper + limits.lower), 0.0)
-    reach = np.where(bounded, SHARE * (limits.upper - limits.lower), FREE_RAD)
-    speed = np.where(limits.velocity > 0.0, SHARE * limits.velocity, FREE_RAD_S)
+    reach = np.where(bounded, SHARE * (limits.upper - limits.lower), 1.5)  # rad
+    speed = np.where(limits.velocity > 0.0, SHARE * limits.velocity, 1.0)  # rad/s
     t: Array = STEP_S * np.arange(round(MOTION_S / STEP_S), dtype=np.float64)
     w = 2.0 * np.pi * rng.uniform(*BAND_HZ, (SINES, 1, n))
     angle = w * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, (SINES, 1, n))

@@ -58,17 +58,9 @@ def compile_first(documented: SelfModel, settings: PipelineSettings, every: int,
     """
     announcer = announce_compiling(say)
     settings = with_imus(settings, ())  # there are none in the made-up motion
-    log = _motion(documented, settings.filter.period_s)
-    make_front_end(documented, settings).step(
-        JointSample(int(log.stamp_ns[0]), log.q[0], log.dq[0], log.tau[0])
-    )
-    if announcer.compiled:
-        replay(log, documented, settings, ReplayOptions(every))
-
-
-def _motion(documented: SelfModel, period_s: float) -> Log:
-    """Every joint swings about the middle of its range, each at a pace of its own."""
+    # Every joint swings about the middle of its range, each at a pace of its own
     n, limits = documented.tree.n, documented.limits
+    period_s = settings.filter.period_s
     t = period_s * np.arange(round(TRIED_S / period_s), dtype=np.float64)[:, None]
     middle = np.nan_to_num(0.5 * (limits.lower + limits.upper))
     pace = 3.0 + 0.7 * np.arange(n, dtype=np.float64)
@@ -77,4 +69,9 @@ def _motion(documented: SelfModel, period_s: float) -> Log:
     tau = RigidArm.of(documented).torque(q, dq, -(pace**2) * (q - middle))
     stamps = np.round(1e9 * t[:, 0]).astype(np.int64)
     base = np.tile(base_at_rest(documented.gravity)[:9], (len(t), 1))
-    return Log(Path("made up"), documented.tree.joint_names, stamps, q, dq, tau, base=base)
+    log = Log(Path("made up"), documented.tree.joint_names, stamps, q, dq, tau, base=base)
+    make_front_end(documented, settings).step(
+        JointSample(int(log.stamp_ns[0]), log.q[0], log.dq[0], log.tau[0])
+    )
+    if announcer.compiled:
+        replay(log, documented, settings, ReplayOptions(every))

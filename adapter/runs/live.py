@@ -199,7 +199,14 @@ class Publisher:
     def __call__(self, learner: OnlineLearner) -> Snapshot:
         """The estimate as it stands."""
         if self._std is None or self._calls % 50 == 0:  # it takes a millisecond
-            self._std = self._deviations(learner)
+            n, schema, theta = learner.tree.n, learner.schema, learner.theta
+            tables = schema.covariance(), schema.identifiable
+            variance, shown = (np.einsum("jaa->ja", in_parents(schema.R0, x)) for x in tables)
+            lam_std = np.where(shown > SHOWN_ALONE, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+            std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
+            bodies = std[: 10 * (n + 1)].reshape(-1, 10)
+            rows = np.r_[: n - 1, n] if theta.spare_in_use else np.arange(n)
+            self._std = lam_std, bodies[rows], std[10 * (n + 1) :].reshape(-1, n)
         self._calls += 1
         good = learner.verdict.good
         measured = learner.schema.kind == LinkMotionKind.MEASURED
@@ -218,17 +225,6 @@ class Publisher:
             learned=learner.learned,
             lambda_source=LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED,
         )
-
-    @staticmethod
-    def _deviations(learner: OnlineLearner) -> tuple[Any, Any, Any]:
-        n, schema, theta = learner.tree.n, learner.schema, learner.theta
-        tables = schema.covariance(), schema.identifiable
-        variance, shown = (np.einsum("jaa->ja", in_parents(schema.R0, x)) for x in tables)
-        lam_std = np.where(shown > SHOWN_ALONE, np.sqrt(np.maximum(variance, 0.0)), np.nan)
-        std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
-        bodies = std[: 10 * (n + 1)].reshape(-1, 10)
-        rows = np.r_[: n - 1, n] if theta.spare_in_use else np.arange(n)
-        return lam_std, bodies[rows], std[10 * (n + 1) :].reshape(-1, n)
 
 
 def news_of(learner: OnlineLearner) -> dict[str, Any]:

@@ -26,7 +26,6 @@ VERSION = 2
 MODEL, DOCUMENTED = "model.json", "documented.json"
 FIGURES, TRACES = "figures.json", "traces.npz"
 FILES = (MODEL, DOCUMENTED, FIGURES, TRACES)
-NEEDED_FIGURES = ("samples", "learned", "refused", "lambda", "theta")
 
 
 class RunFolderError(ModelError):
@@ -84,7 +83,8 @@ class RunData:
 
     def __post_init__(self) -> None:
         n = self.n
-        missing = [key for key in NEEDED_FIGURES if key not in self.figures]
+        needed = "samples", "learned", "refused", "lambda", "theta"
+        missing = [key for key in needed if key not in self.figures]
         if missing:
             raise RunFolderError(f"the figures lack '{missing[0]}'")
         if self.model.tree.n != n:
@@ -230,7 +230,17 @@ def load_run(folder: str | Path) -> RunData:
     missing = [name for name in FILES if not (folder / name).is_file()]
     if missing:
         raise RunFolderError(f"{folder}: lacks {', '.join(missing)}; a run has {', '.join(FILES)}")
-    arrays = _read_traces(folder / TRACES)
+    path = folder / TRACES
+    try:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path}: cannot be read as traces ({error})") from None
+    version = arrays.get("version")
+    if version is None or version.shape != () or int(version) != VERSION:
+        raise RunFolderError(f"{path}: version {version} of the traces; have: {VERSION}")
+    missing = [key for key in (*TRACE_ARRAYS, "delay_s") if key not in arrays]
+    if missing:
+        raise RunFolderError(f"{path}: lacks the array '{missing[0]}'")
     moving = arrays.get("first_moving_ns")
     try:
         return RunData(
@@ -255,17 +265,3 @@ def _read_figures(path: Path) -> dict[str, Any]:
     if not isinstance(figures, dict):
         raise RunFolderError(f"{path}: needs a JSON object, got {type(figures).__name__}")
     return figures
-
-
-def _read_traces(path: Path) -> dict[str, Any]:
-    try:
-        arrays = read_arrays(path)
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{path}: cannot be read as traces ({error})") from None
-    version = arrays.get("version")
-    if version is None or version.shape != () or int(version) != VERSION:
-        raise RunFolderError(f"{path}: version {version} of the traces; have: {VERSION}")
-    missing = [key for key in (*TRACE_ARRAYS, "delay_s") if key not in arrays]
-    if missing:
-        raise RunFolderError(f"{path}: lacks the array '{missing[0]}'")
-    return arrays

@@ -34,7 +34,6 @@ from drivers.files.mcap.writer import EXTERNAL_TORQUES
 from drivers.files.messages import Message, encode, header
 from drivers.files.ros_types import JOINT_STATE, STRING, schemas
 
-DESCRIPTION_S = 2.0  # what is said once comes again and again: nobody is told what was before
 NONE: Array = np.zeros(0)
 TOPICS = {
     **dict.fromkeys(
@@ -114,7 +113,8 @@ class FoxgloveView:
 
     def _due(self, now: Now) -> Iterator[Message]:
         stamp_ns, view = now.stamp_ns, now.view
-        if view.elapsed_s - self._described_s > DESCRIPTION_S:
+        # what is said once comes again and again: nobody is told what was before
+        if view.elapsed_s - self._described_s > 2.0:
             self._described_s, self._headline = view.elapsed_s, ""
             yield from self._messages.first(stamp_ns)
         if np.isfinite(now.q).all():

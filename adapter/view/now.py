@@ -23,10 +23,7 @@ from adapter.realtime.snapshot import Snapshot
 from adapter.realtime.timing import LoopTiming
 from adapter.signals.records import StateLayout, stamp_of
 
-ROWS_A_LOOK = 8  # states of which the residual is computed, spread over those since the last look
-RMS_S, LATELY_S = 1.0, 5.0  # of residuals; of timing
 ABOVE_NOISE = 2.0  # times the noise, beyond which a residual is said to be more
-BEHIND = 1000  # samples that wait for the learner, beyond which it is said
 WAITING, LEARNING, CONVERGED = "waiting", "learning", "converged"
 
 
@@ -143,11 +140,11 @@ class Residual:
         NaN before anything is known."""
         if self._ready and len(records):
             at = self._layout
-            for k in np.unique(np.linspace(0, len(records) - 1, ROWS_A_LOOK).astype(int)):
+            for k in np.unique(np.linspace(0, len(records) - 1, 8).astype(int)):
                 row = records[k]
                 self._last = row[at.joint_tau] - self._model(row[at.q], row[at.dq], row[at.ddq])
                 since_s = 1e-9 * (stamp_of(row) - self._stamp_ns)
-                keep = math.exp(-since_s / RMS_S) if since_s > 0.0 else 0.0
+                keep = math.exp(-since_s / 1.0) if since_s > 0.0 else 0.0
                 self._stamp_ns = stamp_of(row)
                 before = np.where(np.isfinite(self._power), self._power, self._last**2)
                 self._power = keep * before + (1.0 - keep) * self._last**2
@@ -221,7 +218,7 @@ class Onlooker:
         if past and past[-1][1] is timing:
             return self._late
         past.append((view.elapsed_s, timing))
-        while len(past) > 2 and view.elapsed_s - past[1][0] > LATELY_S:
+        while len(past) > 2 and view.elapsed_s - past[1][0] > 5.0:
             past.popleft()
         self._late = timing.since(past[0][1]) if len(past) > 1 else timing
         return self._late
@@ -312,7 +309,7 @@ def headline(view: View, states: tuple[str, str], tree: Tree) -> str:
         return f"Contact: something pushes {tree.joint_names[view.push.contact_joint]}"
     if view.news.get("refusal"):
         return "The torques are not those of this arm: nothing is called converged"
-    late = f"; the learner is {view.waiting} samples behind" if view.waiting > BEHIND else ""
+    late = f"; the learner is {view.waiting} samples behind" if view.waiting > 1000 else ""
     lam, theta = states
     if lam == WAITING:
         return f"Waiting for the first motion{late}"

@@ -41,7 +41,6 @@ DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimate
 ESTIMATE_S = 0.5
 FAST_ROWS, SLOW_ROWS = 400, 240  # kept of the past, for a page that comes late or comes back
 FIRST_S = 0.25  # between two of the slow rows, at first
-RECENT = ("t", "residual", "noise")  # of a frame, that a page gets of the past
 Message = dict[str, Any]
 
 
@@ -112,13 +111,22 @@ class Messages:
     def take(self, now: Now) -> dict[str, Message]:
         """Messages that are due, by their kind."""
         due = {"frame": self._frame(now)}
-        self._recent.append(encode({key: due["frame"][key] for key in RECENT}))
+        self._recent.append(encode({key: due["frame"][key] for key in ("t", "residual", "noise")}))
         final, elapsed_s = now.view.done, now.view.elapsed_s
         if now.frames is not None and (final or elapsed_s >= self._estimate_at):
             self._estimate_at = elapsed_s + ESTIMATE_S
             due["estimate"] = self._estimate(now)
             self._whole.add(now.t_s, encode(due["estimate"]))
-        news = self._news(now)
+        told = now.view.news
+        news = json_ready(
+            {
+                "findings": [_finding(found) for found in now.findings],
+                "load": now.load,
+                "notes": told.get("notes", []),
+                "refused": told.get("refused", 0),
+                "lines": now.view.lines,
+            }
+        )
         if news != self._said:
             due["news"] = self._said = news
         if now.lately is not None and (final or now.view.timing is not self._timing):
@@ -174,17 +182,6 @@ class Messages:
             "effects": numbers(snapshot.effects, FINE_DIGITS),
             "effects_std": numbers(snapshot.effects_std, FINE_DIGITS),
         }
-
-    def _news(self, now: Now) -> Message:
-        news = now.view.news
-        told = {
-            "findings": [_finding(found) for found in now.findings],
-            "load": now.load,
-            "notes": news.get("notes", []),
-            "refused": news.get("refused", 0),
-            "lines": now.view.lines,
-        }
-        return json_ready(told)
 
     def _times(self, now: Now) -> Message:
         timing, lately = now.view.timing, now.lately

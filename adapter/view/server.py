@@ -28,8 +28,6 @@ NAMES = ("127.0.0.1", "localhost")  # that a browser on this machine may call it
 DEFAULT_PORT = 8400
 LISTENERS, CONNECTIONS = 8, 32  # at most: pages, and all that are open at a time
 HEAD_S, SEND_S = 5.0, 5.0  # a request has to be whole, and a listener to take something, in this
-KEEP_ALIVE_S = 2.0
-SEND_BUFFER = 1 << 17  # bytes that wait for a slow listener: a second or two of frames
 GOODBYE_S = 1.5
 STREAM = ("hello", "history", "news", "estimate", "timing", "frame")  # in this order
 HEADERS = {
@@ -263,7 +261,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.SERVICE_UNAVAILABLE, b"too many pages listen\n", more=retry)
             return
         try:
-            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            # what waits for a slow listener is a second or two of frames
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 17)
             self.send_response(HTTPStatus.OK)
             for name, value in {**HEADERS, "Content-Type": "text/event-stream"}.items():
                 self.send_header(name, value)
@@ -273,7 +272,7 @@ class _Handler(BaseHTTPRequestHandler):
             last = False
             while not last:
                 last = server.newest.closed
-                parts = server.newest.after(seen, KEEP_ALIVE_S)
+                parts = server.newest.after(seen, 2.0)
                 events = [b"event: %s\ndata: %s\n\n" % (k.encode(), v) for k, v in parts.items()]
                 self.wfile.write(b"".join(events) or b": still here\n\n")
                 seen["history"] = 1 << 62  # once

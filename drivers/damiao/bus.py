@@ -15,7 +15,6 @@ from drivers.damiao.settings import MULTICAST, VIRTUAL, BusSettings
 from drivers.interface import DriverError
 
 BATCH_LIMIT = 512  # frames in one go; a babbling bus must not stop the loop
-DATAGRAM_BYTES, ANCILLARY_BYTES = 4096, 128
 TIMESPEC = struct.Struct("@ll")  # of SO_TIMESTAMPNS
 UNREADABLE = -1  # in place of an id: bytes that are no CAN frame
 ERROR_FRAME, NOT_A_REPLY = 1, 2
@@ -72,9 +71,7 @@ class MulticastWire(Wire):
         recvmsg = self._socket.recvmsg
         while len(frames) < BATCH_LIMIT:
             try:
-                data, ancillary, _, _ = recvmsg(
-                    DATAGRAM_BYTES, ANCILLARY_BYTES, socket.MSG_DONTWAIT
-                )
+                data, ancillary, _, _ = recvmsg(4096, 128, socket.MSG_DONTWAIT)  # bytes
             except BlockingIOError:
                 break
             stamp_s = 0.0

@@ -17,17 +17,11 @@ from drivers.damiao.codec import KD_MAX, KP_MAX, Scales, mit_command
 from drivers.damiao.stream import MotorStream
 from drivers.interface import DriverError
 
-# Own choice. N m/rad per N m of TMAX: full torque at 0.25 rad; DM8009 216, DM4340 112, DM4310 40.
-STIFFNESS_PER_TORQUE = 4.0
 FADE_S = 0.2
 SINK_S = 3.0  # over which a held arm is let down
 STEP_S = 0.002
 SETTLE_AT_MOST_S, REST_S, RESTING = 5.0, 0.15, 0.05  # s, s, rad/s
-SETTLE_SHARE, ADOPTIONS = 0.03, 2  # of each step's torque in the mean; times it is carried anew
 STOP_AT_MOST_S, HELD_S = 1.5, 0.5
-# An arm that something keeps from where it is held is not pushed for good: beyond this share of
-# TMAX in the spring the held angle comes after it, slowly enough for a load that was put on.
-YIELD_SHARE, YIELD_SPEED = 0.15, 0.2  # , rad/s
 # A driven arm that stands still and is pushed nevertheless: shares of TMAX, s, rad/s. Further away
 # than the limits of the loop itself, for which this is the second look. An arm that is free leaves
 # the band of speed in 15 ms under such a torque unless its inertia is above 0.11 kg m² for each N m
@@ -39,7 +33,8 @@ STANDING = 0.05
 
 def gains(limits: Scales) -> tuple[float, float]:
     """(kp, kd) that hold a joint, N m/rad and N m s/rad."""
-    kp = min(STIFFNESS_PER_TORQUE * limits.tau_max, KP_MAX)
+    # own choice: full torque at 0.25 rad; DM8009 216, DM4340 112, DM4310 40 N m/rad
+    kp = min(4.0 * limits.tau_max, KP_MAX)
     return kp, min(0.05 * kp, KD_MAX)  # kd over kp, s
 
 
@@ -78,9 +73,11 @@ class Braker:
         if self.hold is not None:
             self.holding_s += dt_s
             if self.yields:
-                step = YIELD_SPEED * dt_s
+                # What something keeps from its place is not pushed for good: beyond 15 % of TMAX in
+                # the spring the angle comes after it, slowly enough for a load that was put on.
+                step = 0.2 * dt_s  # rad/s
                 for j, limit in enumerate(self._limits):
-                    most = YIELD_SHARE * limit.tau_max / self._gains[j][0]
+                    most = 0.15 * limit.tau_max / self._gains[j][0]
                     away = self.hold[j] - q[j]
                     if abs(away) > most:
                         self.hold[j] -= math.copysign(min(abs(away) - most, step), away)
@@ -202,7 +199,7 @@ def settle(
         braker.carry(now)
         rest_s = rest_s + STEP_S if max(map(abs, stream.motion()[1])) < RESTING else 0.0
         if rest_s >= REST_S:
-            if adopted == ADOPTIONS:
+            if adopted == 2:
                 return hold, mean
             wanted, rest_s = mean, 0.0
             adopted += 1
@@ -243,4 +240,4 @@ def _step(stream: MotorStream, braker: Braker, beat: Callable[[], None]) -> None
 
 
 def _towards(old: Sequence[float], new: Sequence[float]) -> list[float]:
-    return [a + SETTLE_SHARE * (b - a) for a, b in zip(old, new, strict=True)]
+    return [a + 0.03 * (b - a) for a, b in zip(old, new, strict=True)]

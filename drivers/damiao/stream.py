@@ -28,7 +28,6 @@ from drivers.interface import DriverError, Intake
 SEND_FAILURES = 20  # ticks in a row in which a frame could not be sent
 SILENT_NS = 100_000_000
 OWN_ID, STRANGER = -1, -2  # in place of a joint's index
-SETTLE_EVERY, SETTLE_TIMES = 16, 8  # ticks; looks after which a missing reply counts as lost
 
 # A motor's alarm is believed when it says so so often, not further apart than this: bits can flip.
 ALARMS, ALARM_TICKS = 3, 3
@@ -179,7 +178,7 @@ class ReplyIntake:
         intake.received += used
         intake.used += used
         self._ticks += 1
-        if self._ticks % SETTLE_EVERY == 0:
+        if self._ticks % 16 == 0:
             self._settle()
 
     def sample_at(self, stamp_ns: int) -> tuple[list[float], bool]:
@@ -301,7 +300,7 @@ class ReplyIntake:
             if self._looks == 0 or count < self._unsettled[j]:
                 self._unsettled[j] = count
         self._looks += 1
-        if self._looks == SETTLE_TIMES:
+        if self._looks == 8:  # then a missing reply counts as lost
             self._looks = 0
             for j, count in enumerate(self._unsettled):
                 if count > 0:

@@ -79,12 +79,14 @@ FAULTS = {
     ),
     0xE: Status("overload", "reduce the load or the speed, then switch the motor off and on"),
 }
-UNDOCUMENTED = Status("undocumented status", "switch the motor off and on, and ask its maker")
 
 
 def fault_of(status: int) -> Status | None:
     """What is wrong with a motor of this status; None where it is enabled or disabled."""
-    return None if status in (DISABLED, ENABLED) else FAULTS.get(status, UNDOCUMENTED)
+    if status in (DISABLED, ENABLED):
+        return None
+    unknown = Status("undocumented status", "switch the motor off and on, and ask its maker")
+    return FAULTS.get(status, unknown)
 
 
 def type_of(limits: Scales) -> str:

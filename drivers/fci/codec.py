@@ -126,7 +126,20 @@ class StateDecoder:
             raise WireError(f"a state with the absurd message id {message_id}")
         status_bytes = bytes(data[start + self._at.modes : start + self._at.rate])
         if status_bytes != self._last_bytes or self._last is None:
-            self._last = _status(status_bytes, self.version)
+            # Modes and errors from the 85 bytes that hold them
+            generator, controller, robot_mode = status_bytes[0], status_bytes[1], status_bytes[-1]
+            errors, reflex = status_bytes[2 : 2 + ERROR_COUNT], status_bytes[2 + ERROR_COUNT : -1]
+            for what, value, count in (
+                ("motion generator mode", generator, tables.GENERATOR_MODES[self.version]),
+                ("controller mode", controller, tables.CONTROLLER_MODES),
+                ("robot mode", robot_mode, tables.ROBOT_MODES),
+                ("error flag", max(max(errors), max(reflex)), 2),
+            ):
+                if value >= count:
+                    raise WireError(
+                        f"a state with the unknown {what} {value}; it ends at {count - 1}"
+                    )
+            self._last = Status(generator, controller, errors, reflex, robot_mode)
             self._last_bytes = status_bytes
         wire = np.frombuffer(data, self._wire, 6 * JOINTS, start + self._at.torques)
         numbers = wire.astype(np.float64)
@@ -148,21 +161,6 @@ class StateDecoder:
     def load(self, data: memoryview, start: int) -> Array:
         """(13,) of the state at `start`: mass (kg), inertia (9,) and centre (3,) of the load."""
         return np.frombuffer(data, self._wire, 13, start + self._at.load).astype(np.float64)
-
-
-def _status(data: bytes, version: int) -> Status:
-    """Modes and errors from the 85 bytes that hold them. Raises WireError."""
-    generator, controller, robot_mode = data[0], data[1], data[-1]
-    errors, reflex = data[2 : 2 + ERROR_COUNT], data[2 + ERROR_COUNT : -1]
-    for what, value, count in (
-        ("motion generator mode", generator, tables.GENERATOR_MODES[version]),
-        ("controller mode", controller, tables.CONTROLLER_MODES),
-        ("robot mode", robot_mode, tables.ROBOT_MODES),
-        ("error flag", max(max(errors), max(reflex)), 2),
-    ):
-        if value >= count:
-            raise WireError(f"a state with the unknown {what} {value}; it ends at {count - 1}")
-    return Status(generator, controller, errors, reflex, robot_mode)
 
 
 class CommandEncoder:

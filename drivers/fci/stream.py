@@ -19,7 +19,6 @@ TICK_NS = 1_000_000
 STALE_NS = 500_000_000  # a waiting state older than this tells of an absent loop, not of the arm
 # States in a row of another count, from which on it is followed: fewer for a later one, since a
 # motion does not survive 20 ticks without commands; late datagrams may come many in a row.
-NEWER_COUNT_AFTER, OLDER_COUNT_AFTER = 10, 100
 SLACK_TICKS = 20  # that a count may be ahead of the time that has passed
 
 
@@ -113,7 +112,7 @@ class StateIntake:
         else:
             self._others = 1
         self._other_id = message_id
-        needed = NEWER_COUNT_AFTER if message_id > self._id else OLDER_COUNT_AFTER
+        needed = 10 if message_id > self._id else 100  # in a row
         return self._others >= needed
 
     def _count(self, reason: Refusal, number: int) -> None:

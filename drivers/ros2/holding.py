@@ -20,7 +20,6 @@ from drivers.interface import Array
 
 MOST_ACCELERATION = 2500.0  # rad/s² that the largest torque gives to the lightest joint
 DAMPED_SHARE = 0.3  # of the speed, in one period
-SPRING_RATE, INTEGRAL_RATE = 10.0, 1.5  # 1/s: stiffness over damping, integral over stiffness
 BRAKE_S = 0.25  # from the speed it has to a stand
 SLOW, SLOW_S = 0.05, 0.1  # rad/s, s: then it stands
 
@@ -41,7 +40,7 @@ class Braker:
     def __init__(self, effort: Array, period_s: float, gravity: bool) -> None:
         self.effort, self._period_s, self._gravity = effort, period_s, gravity
         self._kd = DAMPED_SHARE * effort / MOST_ACCELERATION / max(period_s, 1e-3)
-        self._kp = SPRING_RATE * self._kd
+        self._kp = 10.0 * self._kd  # 1/s
         self._mean: Array | None = None  # [dq, tau] (2, n)
         self.release()
 
@@ -77,7 +76,7 @@ class Braker:
         # at rest the spring has a share of the largest torque
         away, most = self._goal - q, (0.15 if self.standing else 1.0) * self.effort
         self._integral = np.clip(
-            self._integral + INTEGRAL_RATE * self._kp * away * self._period_s, -most, most
+            self._integral + 1.5 * self._kp * away * self._period_s, -most, most
         )
         spring = np.clip(self._kp * away + self._integral, -most, most)
         wanted = self._carry + spring + self._kd * (speed - dq)

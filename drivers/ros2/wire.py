@@ -24,7 +24,6 @@ LOCAL = """<CycloneDDS><Domain Id="any"><General><Interfaces>
 </General><Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>64</MaxAutoParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers>
 </Discovery></Domain></CycloneDDS>"""  # this machine only, without multicast
-MISSING = "DDS needs a package that is not installed: pip install 'panda-adapter[ros]'"
 MOST_TAKEN, MOST_ENDS = 32, 4096
 
 
@@ -62,7 +61,9 @@ class Network:
             from cyclonedds.core import DDSException
             from cyclonedds.domain import DomainParticipant
         except ImportError as error:
-            raise DriverError(MISSING) from error
+            raise DriverError(
+                "DDS needs a package that is not installed: pip install 'panda-adapter[ros]'"
+            ) from error
         try:
             if local:
                 _domain_of_this_machine(domain)

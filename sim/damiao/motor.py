@@ -21,15 +21,11 @@ HOT_MOSFET, HOT_ROTOR, LOST_COMMUNICATION, OVERLOAD = 0xB, 0xC, 0xD, 0xE
 # Registers that do something here.
 MST_ID, ESC_ID, TIMEOUT, CTRL_MODE = 7, 8, 9, 10
 OVER_TEMPERATURE, PMAX, VMAX, TMAX, CAN_BR = 2, 21, 22, 23, 35
-MOTOR_POSITION, OUTPUT_POSITION = 80, 81
 # What the motor measures or what it is; a write is answered with the value as it was.
 READ_ONLY = frozenset({13, 14, 15, 16, 17, 18, 19, 20, 36, 50, 51, 52, 53, 54, 55, 80, 81})
 MIT_MODE = 1
 # Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
 AIR_C = 25.0
-ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
-MOSFET_RISE_K, MOSFET_TIME_S = 30.0, 60.0
-MOSFET_LIMIT_C, ROTOR_LIMIT_C = 120.0, 100.0
 NEVER_NS = 1 << 62
 
 
@@ -158,19 +154,19 @@ class Motor:
     def warm_up(self, tau: float, for_s: float) -> None:
         """Temperatures after a torque of tau N m for so long; too hot is an error."""
         load = (tau / self.kind.rated) ** 2
-        rotor, mosfet = AIR_C + ROTOR_RISE_K * load, AIR_C + MOSFET_RISE_K * load
-        self.rotor_c += (rotor - self.rotor_c) * min(for_s / ROTOR_TIME_S, 1.0)
-        self.mosfet_c += (mosfet - self.mosfet_c) * min(for_s / MOSFET_TIME_S, 1.0)
+        rotor, mosfet = AIR_C + 60.0 * load, AIR_C + 30.0 * load
+        self.rotor_c += (rotor - self.rotor_c) * min(for_s / 300.0, 1.0)
+        self.mosfet_c += (mosfet - self.mosfet_c) * min(for_s / 60.0, 1.0)
         if self.rotor_c > self.registers[OVER_TEMPERATURE]:
             self.fail(HOT_ROTOR)
-        elif self.mosfet_c > MOSFET_LIMIT_C:
+        elif self.mosfet_c > 120.0:
             self.fail(HOT_MOSFET)
 
     def read(self, register: int, q: float) -> float | None:
         """Value of a register at joint angle q; None where there is none."""
-        if register == OUTPUT_POSITION:
+        if register == 81:  # of the output
             return q - self.zero
-        if register == MOTOR_POSITION:
+        if register == 80:  # of the motor
             return (q - self.zero) * self.kind.gear
         return self.registers.get(register)
 
@@ -198,7 +194,7 @@ def _delivered(motor_id: int, reply_id: int, kind: MotorType, scale: FullScale) 
     """Registers as a motor has them when it is switched on; plausible where nothing hangs on it."""
     values: dict[int, float] = dict.fromkeys([*range(37), *range(50, 56), 80, 81], 0.0)
     values.update(dict.fromkeys(INTEGER_REGISTERS, 0))
-    values.update({0: 15.0, 1: 1.0, OVER_TEMPERATURE: ROTOR_LIMIT_C, 3: 0.98, 29: 60.0, 30: 1.0})
+    values.update({0: 15.0, 1: 1.0, OVER_TEMPERATURE: 100.0, 3: 0.98, 29: 60.0, 30: 1.0})
     values.update({MST_ID: reply_id, ESC_ID: motor_id, TIMEOUT: 0, CTRL_MODE: MIT_MODE})
     values.update({14: 5015, 15: motor_id, 16: 14, 20: kind.gear})
     values[CAN_BR] = 9  # 5 Mbit/s

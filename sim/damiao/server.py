@@ -475,7 +475,16 @@ class World:
         for _ in range(due):
             self._law = law_at(self.end_ns, self._law.ff1)
             self._engine.set_time(-1.0 if t0_ns is None else (self.end_ns - t0_ns) * 1e-9)
-            self._tick()
+            self.end_ns += PERIOD_NS
+            self.ticks += 1
+            self._from = self._to
+            if not self.held:
+                self._engine.drive(self._law)
+                self._to = self._engine.state()
+                self.fastest = max(self.fastest, float(np.abs(self._to[1]).max()))
+                self.stop_ticks += self._engine.stopped
+                self.limp_ticks += not self._law.most.all()
+            self._lists()
 
     def at(self, now_ns: int, joint: int) -> tuple[float, float, float]:
         """q rad, dq rad/s and motor torque N m of a joint (from 0) at an instant of the last tick.
@@ -499,18 +508,6 @@ class World:
     def close(self) -> None:
         """Free the simulator; may be called more than once."""
         self._engine.close()
-
-    def _tick(self) -> None:
-        self.end_ns += PERIOD_NS
-        self.ticks += 1
-        self._from = self._to
-        if not self.held:
-            self._engine.drive(self._law)
-            self._to = self._engine.state()
-            self.fastest = max(self.fastest, float(np.abs(self._to[1]).max()))
-            self.stop_ticks += self._engine.stopped
-            self.limp_ticks += not self._law.most.all()
-        self._lists()
 
     def _lists(self) -> None:
         """Each joint's numbers side by side: `at` works on single joints."""

@@ -43,11 +43,6 @@ ENCODER_STEP = 2 * np.pi / 2**19  # rad; 19 bits, usual for magnetic absolute en
 # rad rms, our choice: with the quantisation it makes the differentiated position as noisy
 # (6 mrad/s rms) as the velocities of a real Panda's log are (sim/models/panda.toml, [noise]).
 ENCODER_NOISE = 0.2 * ENCODER_STEP
-# Of the effort limit, rms; a real Panda's log has 0.15 to 0.22 % at its four large joints
-# (sim/models/panda.toml, [noise] tau_above_50hz over effort).
-TORQUE_SHARE = 2e-3
-GYRO_DENSITY = np.radians(0.007)  # rad/s/√Hz; MEMS unit Xsens MTi-1, data sheet, 0.007 °/s/√Hz
-ACCEL_DENSITY = 120e-6 * STANDARD_GRAVITY  # m/s²/√Hz; the same unit, 120 µg/√Hz
 
 
 def measured(truth: TreeTruth, record: FallRecord, rng: np.random.Generator) -> dict[str, Array]:
@@ -69,7 +64,9 @@ def measured(truth: TreeTruth, record: FallRecord, rng: np.random.Generator) -> 
     _, link_w, link_a, _ = record.links(truth)
     # The reading before the first sample too: a step of the simulator ends with q = q' + h dq.
     before = record.q[:1] - record.dq[:1] / RATE_HZ
-    gyro, accel = (d * np.sqrt(RATE_HZ / 2) for d in (GYRO_DENSITY, ACCEL_DENSITY))
+    # rad/s/√Hz and m/s²/√Hz of a MEMS unit, Xsens MTi-1: data sheet, 0.007 °/s/√Hz, 120 µg/√Hz
+    densities = np.radians(0.007), 120e-6 * STANDARD_GRAVITY
+    gyro, accel = (d * np.sqrt(RATE_HZ / 2) for d in densities)
 
     def noisy(x: Array, size: float | Array) -> Array:
         return x + size * rng.standard_normal(x.shape)
@@ -79,7 +76,9 @@ def measured(truth: TreeTruth, record: FallRecord, rng: np.random.Generator) -> 
     return {
         "q": read[1:],
         "dq": np.diff(read, axis=0) * RATE_HZ,
-        "tau": noisy(record.tau, TORQUE_SHARE * truth.limits.effort),
+        # of the effort limit, rms; a real Panda's log has 0.15 to 0.22 % at its four large joints
+        # (sim/models/panda.toml, [noise] tau_above_50hz over effort)
+        "tau": noisy(record.tau, 2e-3 * truth.limits.effort),
         "base_w": noisy(record.base_w, gyro),
         "base_a": noisy(record.base_a, accel),
         "link_w": noisy(link_w, gyro),
@@ -215,7 +214,26 @@ def data_set(
         with contextlib.suppress(FileNotFoundError):
             if time.time() - left.stat().st_mtime > 3600.0:  # s
                 left.unlink()
-    key = _key(robot, flight)
+    # 16 hexadecimal digits that change with anything that decides a trajectory's content
+    facts = {
+        "format": FORMAT,
+        "simulator": bullet.getAPIVersion(),
+        "tree": [robot.parent, *(x.tolist() for x in (robot.R, robot.p, robot.theta))],
+        "limits": {k: getattr(robot.limits, k).tolist() for k in fall.BOUNDS},
+        "gravity": robot.gravity.tolist(),
+        "feedback": [fall.BANDWIDTH, fall.DAMPING],
+        "babbling": {
+            "sines": fall.SINES,
+            "low_hz": fall.LOW_HZ,
+            "high_hz": fall.HIGH_HZ,
+            "share": fall.RANGE_SHARE,
+            "top_speed": fall.TOP_SPEED,
+            "speed_share": fall.SPEED_SHARE,
+            "tumble": fall.TUMBLE,
+        },
+        "run": [flight.seconds, RATE_HZ, flight.seed],
+    }
+    key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
     jobs = tuple(
         _Job(robot, k, flight, place / f"{robot.name}_{k:04d}_{key}.npz")
         for k in range(trajectories)
@@ -230,29 +248,6 @@ def cache_folder() -> Path:
         return Path(chosen)
     general = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(general) / "panda-adapter" / "free_fall"
-
-
-def _key(truth: TreeTruth, flight: Flight) -> str:
-    """16 hexadecimal digits that change with anything that decides a trajectory's content."""
-    facts = {
-        "format": FORMAT,
-        "simulator": bullet.getAPIVersion(),
-        "tree": [truth.parent, *(x.tolist() for x in (truth.R, truth.p, truth.theta))],
-        "limits": {k: getattr(truth.limits, k).tolist() for k in fall.BOUNDS},
-        "gravity": truth.gravity.tolist(),
-        "feedback": [fall.BANDWIDTH, fall.DAMPING],
-        "babbling": {
-            "sines": fall.SINES,
-            "low_hz": fall.LOW_HZ,
-            "high_hz": fall.HIGH_HZ,
-            "share": fall.RANGE_SHARE,
-            "top_speed": fall.TOP_SPEED,
-            "speed_share": fall.SPEED_SHARE,
-            "tumble": fall.TUMBLE,
-        },
-        "run": [flight.seconds, RATE_HZ, flight.seed],
-    }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _sound(path: Path) -> bool:

@@ -21,7 +21,6 @@ from sim.truth import FLANGE, Array
 
 # Ranges: Franka FCI documentation.
 FILTER_HZ = (1.0, 1000.0)
-CARTESIAN_DEFAULT = (3000.0, 3000.0, 3000.0, 300.0, 300.0, 300.0)  # N/m, N m/rad, as the next
 STIFFNESS = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)  # N m/rad, libfranka examples
 # Thresholds before a client sets any: chosen here, above what excitation with a hand needs.
 TORQUE_THRESHOLD = (40.0, 40.0, 36.0, 36.0, 10.0, 10.0, 10.0)  # N m
@@ -54,7 +53,7 @@ class Settings:
         default_factory=lambda: (0.0, np.zeros(3), np.zeros((3, 3)))
     )
     stiffness: Array = field(default_factory=lambda: np.array(STIFFNESS))
-    cartesian_stiffness: Array = field(default_factory=lambda: np.array(CARTESIAN_DEFAULT))
+    cartesian_stiffness: Array = field(default_factory=lambda: np.repeat([3000.0, 300.0], 3))
     lower_torque: Array = field(default_factory=lambda: np.array(TORQUE_THRESHOLD))
     upper_torque: Array = field(default_factory=lambda: np.array(TORQUE_THRESHOLD))
     lower_force: Array = field(default_factory=lambda: np.array(FORCE_THRESHOLD))
@@ -125,7 +124,6 @@ class Settings:
         return True
 
 
-EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * 10.0 * TICK_S)  # Hz, low pass of the external torque
 # The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
 # is what a command per millisecond holds stable on a rigid arm.
 FASTEST_RATE = 60.0  # 1/s
@@ -230,7 +228,8 @@ class Arm:
         middle = (q + self.q) / 2, (dq + self.dq) / 2, (self.dq - dq) / TICK_S
         sensed = self.sample.tau + (drive - self._drive) / 2  # brought to the tick's middle
         outside = sensed - self.model(*middle)
-        self.tau_external += EXTERNAL_GAIN * (outside - self.tau_external)
+        share = 1.0 - np.exp(-2 * np.pi * 10.0 * TICK_S)  # a low pass of 10 Hz
+        self.tau_external += share * (outside - self.tau_external)
         self._look()
 
     def model(self, q: Array, dq: Array, ddq: Array) -> Array:

@@ -12,18 +12,13 @@ from sim.fci.codec import TICK_S, Generator, RobotCommand
 from sim.truth import Array, Limits, turn_about
 
 ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
-START_TOLERANCE = 1e-3  # m and rad, first pose from the desired one; the robot's is not published
 ELBOW_TOLERANCE = 1e-2  # rad, chosen
 RIGID = 1e-4  # so far R^T R of a pose may be from the identity
-JERK_PER_ACCELERATION = 500.0  # 1/s: 7500 rad/s³ at 15 rad/s² (Franka FCI documentation)
 # Differences over 1 ms of positions that the client had as f32 are off by up to 500 rad/s³
 # (and 2e-4 rad/s), which a motion along its limits shall not be blamed for.
 ROOM, SPEED_ROOM = 1.1, 1.001
 
-START_ELBOW = "cartesian_motion_generator_start_elbow_invalid"
-START_SIGN = "start_elbow_sign_inconsistent"
 SIGN = "cartesian_motion_generator_elbow_sign_inconsistent"
-ELBOW = "cartesian_motion_generator_elbow_limit_violation"
 OF_JOINTS = "cartesian_motion_generator_joint"  # how errors of the joints' own motion begin
 
 Reach = Callable[[Array, Array, float], tuple[Array, float]]
@@ -86,7 +81,8 @@ class CartesianMotion:
         if not rigid(pose):
             return "cartesian_position_motion_generator_invalid_frame_flag"
         step = difference(self.pose, pose)
-        if self._fresh and not (np.abs(step) <= START_TOLERANCE).all():
+        # m and rad, the first pose from the desired one; the robot's own is not published
+        if self._fresh and not (np.abs(step) <= 1e-3).all():
             return "cartesian_position_motion_generator_start_pose_invalid"
         return self._go(pose.copy(), step / TICK_S, elbow)
 
@@ -106,12 +102,14 @@ class CartesianMotion:
         if elbow is None:
             return None
         if elbow[1] != (1.0 if self.q[3] > ELBOW_FLIP else -1.0):
-            return START_SIGN if self._fresh else SIGN
+            return "start_elbow_sign_inconsistent" if self._fresh else SIGN
         away = abs(elbow[0] - self.q[2])
         if self._fresh:
-            return None if away <= ELBOW_TOLERANCE else START_ELBOW
+            wrong = "cartesian_motion_generator_start_elbow_invalid"
+            return None if away <= ELBOW_TOLERANCE else wrong
         step = 2.175 * TICK_S  # rad/s (Franka FCI documentation)
-        return None if away <= ELBOW_TOLERANCE + step else ELBOW
+        far = "cartesian_motion_generator_elbow_limit_violation"
+        return None if away <= ELBOW_TOLERANCE + step else far
 
     def _go(self, pose: Array, twist: Array, elbow: float) -> str | None:
         acceleration = (twist - self.twist) / TICK_S
@@ -158,7 +156,8 @@ def broken(limits: Limits, motion: str, q: Array, rates: tuple[Array, ...]) -> s
     most = limits.acceleration * ROOM
     if not (np.abs(ddq) <= most).all():
         return f"{motion}_velocity_discontinuity"
-    if not (np.abs(ddq - before) <= JERK_PER_ACCELERATION * TICK_S * most).all():
+    # 1/s: 7500 rad/s³ at 15 rad/s² (Franka FCI documentation)
+    if not (np.abs(ddq - before) <= 500.0 * TICK_S * most).all():
         return f"{motion}_acceleration_discontinuity"
     return None
 

@@ -34,7 +34,6 @@ FIELDS = (
     ("O_ddP_O", 3), ("elbow_c", 2), ("delbow_c", 2), ("ddelbow_c", 2), ("O_T_EE_c", 16),
     ("O_dP_EE_c", 6), ("O_ddP_EE_c", 6), ("theta", 7), ("dtheta", 7),
 )  # fmt: skip
-ACCELEROMETERS = (("accelerometer_top", 18), ("accelerometer_bottom", 18))  # version 10 only
 
 ERRORS = (
     "joint_position_limits_violation", "cartesian_position_limits_violation",
@@ -140,7 +139,8 @@ class StateFrame:
         if version not in VERSIONS:
             raise ValueError(f"no protocol {version}; have: 5, 10")
         kind = np.dtype("<f8" if version == 5 else "<f4")
-        listed = FIELDS if version == 5 else FIELDS + ACCELEROMETERS
+        more = ("accelerometer_top", 18), ("accelerometer_bottom", 18)
+        listed = FIELDS if version == 5 else FIELDS + more
         total = sum(count for _, count in listed)
         self._modes = 8 + total * kind.itemsize
         self._rate = struct.Struct("<d" if version == 5 else "<f")
@@ -267,11 +267,6 @@ _OTHERS = {
 }
 
 
-def code_of(request: str, status: Status, version: int) -> int:
-    """Number of a status in the reply to a request, one of `NAMES`."""
-    return _CODES.get(request, _OTHERS)[status][version == 10]
-
-
 @dataclass(frozen=True, slots=True)
 class Request:
     """One request of a client.
@@ -336,6 +331,6 @@ class RequestReader:
 
 def reply(request: Request, status: Status, version: int, rest: bytes = b"") -> bytes:
     """A reply: header, status byte, and whatever this request's reply has besides."""
-    code = code_of(request.name, status, version)
+    code = _CODES.get(request.name, _OTHERS)[status][version == 10]
     size = HEADER.size + 1 + len(rest)
     return HEADER.pack(request.number, request.ident, size) + bytes((code,)) + rest

@@ -319,7 +319,6 @@ def _elbow(field: Floats, q: Array) -> None:  # position of joint 3, side of joi
 WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
 # Until the first command the client still changes over from replies to states. Chosen here: longer
 # than 20 ms, since a client on a machine without real-time kernel may be held up just then.
-FIRST_COMMAND_TICKS = 200
 # N m from one tick to the next; the margin is the rounding of an f32 tau_J_d near 87 N m.
 TORQUE_STEP, ROUNDING = 1.0, 1e-5
 COMMUNICATION = "communication_constraints_violation"
@@ -433,7 +432,7 @@ class CommandedMotion:
     def _miss(self) -> str | None:
         if not self.begun:  # nothing is due before the first one
             self._before += 1
-            return COMMUNICATION if self._before >= FIRST_COMMAND_TICKS else None
+            return COMMUNICATION if self._before >= 200 else None
         self._note(False)
         self._missed += 1
         if self._missed >= 20:  # in a row, then communication_constraints_violation

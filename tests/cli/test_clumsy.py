@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from adapter.cli.main import COMMANDS, build_parser
-from drivers.errors import choices
 
 RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 FILES = {  # the words after a command, FILE being what cannot be used
@@ -93,10 +92,6 @@ def test_a_wrong_option_is_told_with_the_likeliest(command: str, here: Path, ref
 def test_what_is_misspelt_is_guessed(line: str, said: str, here: Path, refused) -> None:
     words = (str(RECORDING) if word == "LOG" else word for word in line.split())
     assert said in refused(*words)
-
-
-def test_nothing_alike_is_not_guessed() -> None:
-    assert choices("zebra", ["panda", "fr3"]) == "have: panda, fr3"
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ import pytest
 
 pytestmark = pytest.mark.alone
 
-CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 START_S = 240.0
 
 
@@ -50,7 +49,7 @@ class Terminal:
 
     @property
     def text(self) -> str:
-        return CONTROL.sub("", self._raw.decode(errors="replace"))
+        return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self._raw.decode(errors="replace"))
 
     def wait_for(self, pattern: str) -> re.Match[str]:
         end = time.monotonic() + START_S

@@ -92,7 +92,20 @@ class Line:
 
     def arrive(self, sample: JointSample, tick: int) -> list[JointSample]:
         on = [fault for fault in self._faults if fault.on(tick)]
-        sample = self._altered(sample, on)
+        q, dq, stamp_ns = sample.q.copy(), sample.dq.copy(), sample.stamp_ns
+        for fault in on:
+            j = fault.joint
+            if fault.kind == "nan":
+                q[fault.at % 7] = dq[(fault.at + 3) % 7] = np.nan
+            elif fault.kind == "stuck":
+                q[j], dq[j] = self._frozen.setdefault(id(fault), (q[j], dq[j]))
+            elif fault.kind in ("jump", "spike"):
+                q[j] += fault.size
+            elif fault.kind == "fast":
+                dq[j] += fault.size
+            elif fault.kind == "clock":
+                stamp_ns += round(1e9 * fault.size)
+        sample = replace(sample, stamp_ns=stamp_ns, q=q, dq=dq)
         kinds = {fault.kind for fault in on}
         before, self._last = self._last, sample
         if "lost" in kinds:
@@ -107,22 +120,6 @@ class Line:
         if "stale" in kinds and before is not None:
             out = [before]
         return out + out[-1:] if "repeated" in kinds else out
-
-    def _altered(self, sample: JointSample, on: list[Fault]) -> JointSample:
-        q, dq, stamp_ns = sample.q.copy(), sample.dq.copy(), sample.stamp_ns
-        for fault in on:
-            j = fault.joint
-            if fault.kind == "nan":
-                q[fault.at % 7] = dq[(fault.at + 3) % 7] = np.nan
-            elif fault.kind == "stuck":
-                q[j], dq[j] = self._frozen.setdefault(id(fault), (q[j], dq[j]))
-            elif fault.kind in ("jump", "spike"):
-                q[j] += fault.size
-            elif fault.kind == "fast":
-                dq[j] += fault.size
-            elif fault.kind == "clock":
-                stamp_ns += round(1e9 * fault.size)
-        return replace(sample, stamp_ns=stamp_ns, q=q, dq=dq)
 
 
 class Record:

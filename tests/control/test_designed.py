@@ -21,7 +21,7 @@ from adapter.errors import SettingsError
 from adapter.model.robots import documented
 from adapter.physics.identifiability import BODY_SIZE
 from sim.scenarios import build
-from tests.helpers.live_tools import played
+from tests.helpers.live_tools import check_course, played
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
@@ -52,18 +52,12 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(robot, seed, share, sto
     how = ExcitationSettings(seed=seed, slow_s=slow, slow_share=0.3)
     motion = Designer(Information(model), steps=8)(limits, start, how)
     lower, upper, speed, acceleration, jerk = motion.bounds()
-    q, dq, ddq = played(motion, stop_s, DT)
+    q, dq, _ = course = played(motion, stop_s, DT)
+    check_course(motion, course, DT)
     assert (q >= limits.lower - 1e-9).all() and (q <= limits.upper + 1e-9).all()
-    assert (q >= lower - 1e-9).all() and (q <= upper + 1e-9).all()
-    assert (np.abs(dq) <= speed + 1e-9).all()
     assert (speed <= 0.95 * limits.speed_between(lower, upper)).all()
-    assert (np.abs(ddq) <= acceleration + 1e-9).all()
-    assert (acceleration <= 0.95 * limits.acceleration).all()
-    found = np.abs(np.diff(ddq, axis=0)) / DT
-    assert (found <= jerk + 1e-6).all() and (jerk <= limits.jerk).all()
+    assert (acceleration <= 0.95 * limits.acceleration).all() and (jerk <= limits.jerk).all()
     np.testing.assert_allclose(q[0], q[1], atol=1e-6)
-    np.testing.assert_allclose(np.diff(q, axis=0) / DT, 0.5 * (dq[1:] + dq[:-1]), atol=2e-4)
-    np.testing.assert_allclose(np.diff(dq, axis=0) / DT, 0.5 * (ddq[1:] + ddq[:-1]), atol=5e-2)
     assert (dq[-1] == 0.0).all()
 
 
@@ -176,19 +170,15 @@ def _played(motion):
 @pytest.mark.parametrize("experiment", [SPEEDS, BOTH_WAYS, STILL, TURN, TURNS])
 def test_moves_the_joints_asked_for_and_comes_back(experiment):
     motion = SweepMotion(LIMITS, READY, ExcitationSettings(), [(3, experiment), (5, experiment)])
-    q, dq, ddq = _played(motion)
+    q, dq, _ = course = _played(motion)
+    check_course(motion, course, STEP)
     lower, upper, speed, acceleration, _ = motion.bounds()
-    assert (q >= lower - 1e-9).all() and (q <= upper + 1e-9).all()
     assert (lower >= LIMITS.lower).all() and (upper <= LIMITS.upper).all()
-    assert (np.abs(dq) <= speed + 1e-9).all() and (speed <= 0.9 * LIMITS.velocity).all()
-    assert (np.abs(ddq) <= acceleration + 1e-9).all()
-    assert (acceleration <= LIMITS.acceleration).all()
+    assert (speed <= 0.9 * LIMITS.velocity).all() and (acceleration <= LIMITS.acceleration).all()
     np.testing.assert_allclose(q[-1], READY, atol=1e-9)
     moved = np.ptp(q, axis=0) > 1e-6
     assert moved[[3, 5]].all() and moved.sum() == 2
     assert not ((dq[:, 3] != 0.0) & (dq[:, 5] != 0.0)).any()  # one after the other
-    np.testing.assert_allclose(np.diff(q, axis=0) / STEP, 0.5 * (dq[1:] + dq[:-1]), atol=1e-4)
-    np.testing.assert_allclose(np.diff(dq, axis=0) / STEP, 0.5 * (ddq[1:] + ddq[:-1]), atol=5e-2)
 
 
 def test_speeds_are_held_either_way_and_rests_come_after_either_direction():

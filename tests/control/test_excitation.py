@@ -24,7 +24,7 @@ from adapter.errors import SettingsError
 from adapter.model.robots import documented
 from sim.plant import SimulatedArm
 from sim.scenarios import build
-from tests.helpers.live_tools import played
+from tests.helpers.live_tools import check_course, played
 from tests.helpers.robot_models import pin_model
 
 PANDA = documented("panda")
@@ -52,7 +52,8 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(
     start = np.minimum(start, LIMITS.upper)  # rounding may lead a last bit beyond
     how = ExcitationSettings(seed=seed, rests=rests, slow_s=slow, slow_share=slow_share)
     motion = RandomMotion(LIMITS, start, how)
-    q, dq, ddq = played(motion, stop_s, DT)
+    q, dq, ddq = course = played(motion, stop_s, DT)
+    check_course(motion, course, DT)
     assert (q >= LIMITS.lower - 1e-9).all() and (q <= LIMITS.upper + 1e-9).all()
     low, high = (
         np.minimum(LIMITS.lower + how.margin, start),
@@ -60,15 +61,12 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(
     )
     assert (q >= low - 1e-9).all() and (q <= high + 1e-9).all()  # further out only to begin with
     bounds = motion.bounds()
-    assert (q >= bounds[0] - 1e-9).all() and (q <= bounds[1] + 1e-9).all()
     assert (bounds[1] - bounds[0] <= how.range_share * (high - low) + 1e-9).all()
     assert (np.abs(dq) <= 0.95 * LIMITS.velocity).all()
     assert (np.abs(ddq) <= 0.95 * LIMITS.acceleration).all()
     assert (np.abs(np.diff(ddq, axis=0)) / DT <= LIMITS.jerk).all()
-    # It starts from where the arm is, is smooth, and stands still in the end.
+    # It starts from where the arm is and stands still in the end.
     np.testing.assert_allclose(q[0], q[1], atol=1e-6)
-    np.testing.assert_allclose(np.diff(q, axis=0) / DT, 0.5 * (dq[1:] + dq[:-1]), atol=1e-4)
-    np.testing.assert_allclose(np.diff(dq, axis=0) / DT, 0.5 * (ddq[1:] + ddq[:-1]), atol=2e-2)
     assert (dq[-1] == 0.0).all()
 
 

@@ -9,7 +9,6 @@ from drivers.damiao.timing import at_instant
 from drivers.interface import JointSample
 
 N, JOINT, PERIOD_NS = 4, 2, 1_000_000
-REACH_NS = 5 * PERIOD_NS
 
 
 def angle(t_s: float) -> tuple[float, float]:
@@ -30,7 +29,7 @@ def why_it_stops(hole: tuple[int, int], jump_rad: float, at: int = 300) -> str:
             readings[j] = [readings[j][1], (k * PERIOD_NS, q, dq, 1.0)]
         stamp_ns = k * PERIOD_NS
         before, after = zip(*readings, strict=True)
-        values, _ = at_instant(stamp_ns, before, after, REACH_NS)
+        values, _ = at_instant(stamp_ns, before, after, 5 * PERIOD_NS)
         sample = JointSample(stamp_ns, *np.array(values).reshape(3, N))
         gate.look(sample, stamp_ns + 10**9)
         try:

@@ -162,53 +162,36 @@ def test_a_failed_recovery_leaves_the_file(tmp_path, whole, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def test_a_cut_index_loses_nothing(tmp_path, whole):
+@pytest.mark.parametrize(("cut", "zeros"), [("index", 0), ("second chunk", 100_000)])
+def test_a_cut_behind_chunks_loses_none_of_them(tmp_path, whole, ends, cut, zeros):
     path = tmp_path / "a.mcap"
-    path.write_bytes(whole[: -len(MAGIC) - 3])
+    path.write_bytes(whole[: -len(MAGIC) - 3 if cut == "index" else ends[1]] + bytes(zeros))
     log = read_log(path)
-    assert len(log) == COUNT
-    assert "cut in its index; no message is lost" in log.warnings[0]
+    assert log.truncated and len(log) == (COUNT if cut == "index" else 2 * EVERY)
+    said = "cut in its index; no message is lost" if cut == "index" else "is cut"
+    assert said in log.warnings[0]
 
 
-def test_zeros_behind_the_cut(tmp_path, whole, ends):
-    path = tmp_path / "a.mcap"
-    path.write_bytes(whole[: ends[1]] + bytes(100_000))
-    log = read_log(path)
-    assert len(log) == 2 * EVERY
-    assert log.truncated
-
-
-def damaged(path: Path, whole: bytes, at: int, bits: int) -> Path:
-    """The recording with some bits of one byte flipped."""
-    data = bytearray(whole)
-    data[at] ^= bits
+@pytest.mark.parametrize(
+    ("chunk", "place", "bits", "said"),
+    [
+        (1, -500, 0xFF, "is damaged and was passed over"),
+        (0, -500, 0xFF, "is damaged"),  # it alone defines the channels; the index repeats them
+        (1, "length", 0x01, "damaged and were passed over"),
+    ],
+)
+def test_a_damaged_chunk_costs_only_itself(tmp_path, whole, ends, chunk, place, bits, said):
+    starts = [c.chunk_start_offset for c in make_reader(BytesIO(whole)).get_summary().chunk_indexes]
+    path, data = tmp_path / "a.mcap", bytearray(whole)
+    data[starts[chunk] + 4 if place == "length" else ends[chunk] + place] ^= bits
     path.write_bytes(data)
-    return path
-
-
-def test_a_damaged_chunk_costs_only_itself(tmp_path, whole, ends):
-    path = damaged(tmp_path / "a.mcap", whole, ends[1] - 500, 0xFF)
     log = read_log(path)
-    assert len(log) == COUNT - EVERY
-    assert "is damaged and was passed over" in log.warnings[0]
-    assert not log.truncated
-    facts = describe(path)
-    assert facts["gaps"]["count"] == 1
-    assert recover(path).messages["/joint_states"] == COUNT - EVERY
-
-
-def test_a_damaged_first_chunk_costs_only_itself(tmp_path, whole, ends):
-    """It alone defines the channels; the index repeats them."""
-    path = damaged(tmp_path / "a.mcap", whole, ends[0] - 500, 0xFF)
-    assert np.array_equal(read_log(path).tau, TORQUES[EVERY:])
-
-
-def test_a_damaged_length_costs_only_its_chunk(tmp_path, whole):
-    start = make_reader(BytesIO(whole)).get_summary().chunk_indexes[1].chunk_start_offset
-    log = read_log(damaged(tmp_path / "a.mcap", whole, start + 4, 0x01))
-    assert len(log) == COUNT - EVERY
-    assert "damaged and were passed over" in log.warnings[0]
-    assert not log.truncated
+    left = np.delete(TORQUES, slice(chunk * EVERY, (chunk + 1) * EVERY), axis=0)
+    assert np.array_equal(log.tau, left)
+    assert said in log.warnings[0] and not log.truncated
+    if place != "length":
+        assert describe(path)["gaps"]["count"] == chunk  # none where the beginning is missing
+        assert recover(path).messages["/joint_states"] == COUNT - EVERY
 
 
 @settings(max_examples=60, deadline=None)

@@ -17,8 +17,6 @@ from drivers.fci.torque_control import (
 )
 from drivers.interface import DriverError, checked_torques
 
-ALLOWED = 1.0  # N m per ms, documented: 1000 N m/s
-
 
 def all_joints(value):
     return [float(value)] * 7
@@ -36,7 +34,7 @@ def raised_to(value):
 
 def test_the_numbers_are_the_robots():
     assert TORQUE_LIMIT == (87.0,) * 4 + (12.0,) * 3
-    assert 0.95 < TORQUE_STEP < ALLOWED
+    assert 0.95 < TORQUE_STEP < 1.0  # N m per ms, documented: 1000 N m/s
 
 
 @given(

@@ -1,11 +1,20 @@
-"""Recordings that are mapped are those in memory, to the last bit and word."""
+"""Long recordings: mapped ones are those in memory, to the last bit and word.
 
+Rows that wait in a file come back bit by bit, and messages whose sizes come again in turn are
+found at once, and none else than one by one.
+"""
+
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 
+from drivers.files import rows
 from drivers.files.mcap import Log, McapWriter, read, read_log, records
+from drivers.files.mcap.records import walk
+from drivers.files.rows import RowsFile
 from tests.helpers.mcap_tools import foreign, payloads, samples
 
 NAMES = ("a", "b", "c")
@@ -98,3 +107,68 @@ def test_messages_outside_of_chunks_come_in_several_regions(tmp_path: Path, monk
     monkeypatch.setattr(records, "_TOGETHER", 700)
     assert len(list(records.McapScan(flat).regions())) == 5
     assert np.array_equal(read_log(flat).q, [s.q for s in items])
+
+
+@pytest.mark.parametrize("in_memory", [64, 2**20])
+def test_rows_come_back_bit_by_bit(monkeypatch, in_memory: int) -> None:
+    monkeypatch.setattr(rows, "IN_MEMORY", in_memory)
+    rng = np.random.default_rng(3)
+    table = rng.standard_normal((500, 5))
+    table[7, 2], table[8, 3], table[9, 0] = np.nan, -0.0, np.int64(2**62 + 1).view(np.float64)
+    kept = RowsFile(5)
+    for start in range(0, 500, 33):
+        kept.append(table[start : start + 33, :])
+        assert kept.rows(start, start + 5).tobytes() == table[start : start + 5].tobytes()
+    assert len(kept) == 500
+    for start, stop in ((0, 500), (5, 10), (490, 600), (700, 800), (9, 3)):
+        found = kept.rows(start, stop)
+        assert found.tobytes() == table[start:stop].tobytes()
+        assert found.shape == table[start:stop].shape
+        assert found.flags.writeable
+
+
+def test_rows_of_another_width_are_refused() -> None:
+    with pytest.raises(ValueError, match="rows of 5 numbers"):
+        RowsFile(5).append(np.zeros((2, 4)))
+
+
+MESSAGE, CHANNEL, INVALID = int(Opcode.MESSAGE), int(Opcode.CHANNEL), 0
+HEAD = struct.calcsize("<BQ")
+
+
+def one(opcode: int, length: int, rng: np.random.Generator) -> bytes:
+    return struct.pack("<BQ", opcode, length) + rng.bytes(length)
+
+
+def one_by_one(data: bytes, most: int | None) -> tuple[list[int], list[int], int]:
+    start, stop, at = [], [], 0
+    while at + HEAD <= len(data):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        if opcode == INVALID or at + HEAD + length > len(data):
+            break
+        if opcode == MESSAGE:
+            if len(start) == most:
+                break
+            start.append(at + HEAD + 22)
+            stop.append(at + HEAD + length)
+        at += HEAD + length
+    return start, stop, at
+
+
+@pytest.mark.parametrize("most", [None, 50, 333])
+@pytest.mark.parametrize("seed", range(12))
+def test_a_walk_finds_what_is_there(seed, most):
+    rng = np.random.default_rng(seed)
+    parts: list[bytes] = []
+    for _ in range(rng.integers(1, 6)):
+        sizes = rng.integers(22, 90, rng.integers(1, 13))  # some turns are longer than looked for
+        for _ in range(rng.integers(1, 60)):
+            parts += [one(MESSAGE, int(x), rng) for x in sizes]
+        if rng.random() < 0.7:
+            parts.append(one(CHANNEL, int(rng.integers(0, 40)), rng))
+    data = b"".join(parts)
+    data = data[: len(data) - int(rng.integers(0, 60))] + bytes(int(rng.integers(0, 40)))
+    found = walk(memoryview(data), 0, frozenset({INVALID}), most)
+    start, stop, end = one_by_one(data, most)
+    assert (list(found.start), list(found.stop), found.end) == (start, stop, end)
+    assert found.full == (most is not None and len(start) == most and end < len(data))

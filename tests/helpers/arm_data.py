@@ -180,19 +180,6 @@ def _step(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return value, 30 * x**2 * (1 - x) ** 2, 60 * x * (1 - x) * (1 - 2 * x)
 
 
-def _envelope(t: np.ndarray, motion: Motion) -> np.ndarray:
-    """(3, m, n): share of the motion of each joint that is on, and its two derivatives."""
-    n = len(MIDDLE)
-    env = np.repeat(np.array(_step(t))[:, :, None], n, axis=2)
-    for begin, end in motion.rests:
-        env -= np.subtract(_step(t - begin), _step(t - end))[:, :, None]
-    if motion.alone is not None:
-        joint, begin = motion.alone
-        others = np.arange(n) != joint
-        env[:, :, others] -= np.array(_step(t - begin))[:, :, None]
-    return env
-
-
 def trajectory(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """q, dq, ddq (m, n) of the motion."""
     rng = np.random.default_rng([motion.seed, 7])
@@ -208,7 +195,16 @@ def trajectory(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ddq = ddq - a * k * k * np.sin(angle)
     share = np.minimum(REACH / np.abs(q).max(axis=0), SPEED / np.abs(dq).max(axis=0))
     q, dq, ddq = q * share, dq * share, ddq * share
-    e, de, dde = _envelope(t, motion)
+    # (3, m, n): share of the motion of each joint that is on, and its two derivatives
+    n = len(MIDDLE)
+    env = np.repeat(np.array(_step(t))[:, :, None], n, axis=2)
+    for begin, end in motion.rests:
+        env -= np.subtract(_step(t - begin), _step(t - end))[:, :, None]
+    if motion.alone is not None:
+        joint, begin = motion.alone
+        others = np.arange(n) != joint
+        env[:, :, others] -= np.array(_step(t - begin))[:, :, None]
+    e, de, dde = env
     return MIDDLE + e * q, de * q + e * dq, dde * q + 2 * de * dq + e * ddq
 
 

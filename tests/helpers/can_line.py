@@ -38,25 +38,24 @@ import can
 from sim.faults import Faults
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000  # bit/s, OpenArm's
-HOST_QUEUE = 64  # frames that the host's controller holds; then it refuses
 START_NS = 1_000_000_000
 FAR_NS = 1 << 62
 
-ERROR_FRAME_BITS = 23  # flag 6, echo of the others up to 6, delimiter 8, gap 3
-FD_SLOW_BITS = 30  # outside of what a bit-rate switch speeds up, with one stuff bit
 STUFFED = 0.084  # stuff bits for each bit that may need one, on average over commands and replies
 
 
 def frame_ns(message: can.Message) -> int:
     """Typical time of an 11-bit frame, 16 bytes or less, and the gap after it, ns (ISO 11898-1)."""
     if message.is_error_frame:
-        return round(ERROR_FRAME_BITS * 1e9 / BITRATE)
+        # flag 6, echo of the others up to 6, delimiter 8, gap 3
+        return round(23 * 1e9 / BITRATE)
     data = 8 * len(message.data)
     if not message.is_fd:
         return round((47 + data + STUFFED * (34 + data)) * 1e9 / BITRATE)
     # From ESI to the checksum, which has stuff bits at fixed places, a switched frame is faster.
     fast = DATA_BITRATE if message.bitrate_switch else BITRATE
-    return round((FD_SLOW_BITS / BITRATE + (33 + data + STUFFED * (5 + data)) / fast) * 1e9)
+    # 30 bits are outside of what a bit-rate switch speeds up, with one stuff bit
+    return round((30 / BITRATE + (33 + data + STUFFED * (5 + data)) / fast) * 1e9)
 
 
 class Node(Protocol):
@@ -167,7 +166,7 @@ class Line:
             return
         since_s = (self._now_ns - self.start_ns) * 1e-9
         struck = self._faults is not None and self._faults.strikes("enobufs", since_s)
-        if struck or len(self._from_host) >= HOST_QUEUE:
+        if struck or len(self._from_host) >= 64:  # frames that its controller holds
             no_room = "Failed to transmit: No buffer space available"  # as socketcan has it
             raise can.CanOperationError(no_room, errno.ENOBUFS)
         own = copy(message)  # the host may change what it sent
@@ -190,7 +189,20 @@ class Line:
                 assert self._node is not None
                 self._node.service()
             else:
-                self._launch()
+                # The ready frame with the lowest id goes onto the wire
+                now, waiting = self._now_ns, self._from_boards
+                ready = [i for i, entry in enumerate(waiting) if entry[2] <= now]
+                index = min(ready, key=waiting.__getitem__, default=-1)
+                host = self._from_host and self._from_host[0][0] <= now
+                if host and (
+                    index < 0 or self._from_host[0][1].arbitration_id <= waiting[index][0]
+                ):
+                    message, to = self._from_host.popleft()[1], self.boards
+                else:
+                    message, to = waiting.pop(index)[3], self.host
+                    heapq.heapify(waiting)
+                took = frame_ns(message)
+                self._flying = now + took, to, message
         else:
             return
         self._now_ns = max(until_ns, self._now_ns)
@@ -208,20 +220,6 @@ class Line:
         if self._from_host:
             ready.append(self._from_host[0][0])
         return max(min(ready), self._free_ns) if ready else FAR_NS
-
-    def _launch(self) -> None:
-        """The ready frame with the lowest id goes onto the wire."""
-        now, waiting = self._now_ns, self._from_boards
-        ready = [i for i, entry in enumerate(waiting) if entry[2] <= now]
-        index = min(ready, key=waiting.__getitem__, default=-1)
-        host = self._from_host and self._from_host[0][0] <= now
-        if host and (index < 0 or self._from_host[0][1].arbitration_id <= waiting[index][0]):
-            message, to = self._from_host.popleft()[1], self.boards
-        else:
-            message, to = waiting.pop(index)[3], self.host
-            heapq.heapify(waiting)
-        took = frame_ns(message)
-        self._flying = now + took, to, message
 
     def _land(self, end_ns: int, to: LineEnd, message: can.Message) -> None:
         """A frame is complete."""

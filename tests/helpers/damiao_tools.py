@@ -12,23 +12,15 @@ from contextlib import suppress
 import can
 import numpy as np
 
+from sim.damiao.codec import FullScale, data_frame, decode_command, encode_feedback
+
 LIMITS = [(12.5, 45.0, 54.0)] * 2 + [(12.5, 10.0, 28.0)] * 2 + [(12.5, 30.0, 10.0)] * 3
 FRAME_NS, SLOT_NS = 50_000, 100_000  # a frame on the wire; replies of neighbours lie so far apart
 STEP_NS = 200_000
 
 
-def code(x, most, bits):
-    return int((min(max(x, -most), most) + most) / (2 * most) * (2**bits - 1))
-
-
-def value(raw, most, bits):
-    return raw / (2**bits - 1) * 2 * most - most
-
-
 def reply_bytes(can_id, status, limits, q, dq, tau, mosfet=30, rotor=35):
-    a, b, c = code(q, limits[0], 16), code(dq, limits[1], 12), code(tau, limits[2], 12)
-    word = (status << 4 | can_id & 0xF) << 56 | a << 40 | b << 28 | c << 16 | mosfet << 8 | rotor
-    return word.to_bytes(8, "big")
+    return encode_feedback(can_id, status, (q, dq, tau), (mosfet, rotor), FullScale(*limits))
 
 
 class Bank:
@@ -89,20 +81,13 @@ class Bank:
         if bytes(data[:7]) == b"\xff" * 7:
             self.status[j] = {0xFB: 0, 0xFC: 1, 0xFD: 0}.get(data[7], self.status[j])
         else:
-            self._take(j, int.from_bytes(data, "big"))
+            self._take(j, data)
         self.heard_ns[j] = now_ns
         return j, self.state(j, now_ns)
 
-    def _take(self, j, word):
-        a, b, c = self.encode[j]
+    def _take(self, j, data):
         self.commanded[j] = self.commanded[j] or self.status[j] == 1
-        self.command[j] = (
-            value(word >> 48, a, 16),
-            value(word >> 36 & 0xFFF, b, 12),
-            (word >> 24 & 0xFFF) / 4095 * 500,
-            (word >> 12 & 0xFFF) / 4095 * 5,
-            value(word & 0xFFF, c, 12),
-        )
+        self.command[j] = decode_command(data, FullScale(*self.encode[j]))
 
     def _service(self, j, data, now_ns):
         if data[2] == 0xCC:
@@ -223,12 +208,4 @@ class Served:
                 continue  # its own, on a bus that hands them back
             said = self.bank.handle(message.arbitration_id, message.data, now_ns)
             if said is not None:
-                self.bus.send(
-                    can.Message(
-                        arbitration_id=0x11 + said[0],
-                        data=said[1],
-                        is_extended_id=False,
-                        is_fd=message.is_fd,
-                        bitrate_switch=message.bitrate_switch,
-                    )
-                )
+                self.bus.send(data_frame(0x11 + said[0], said[1], message.is_fd))

@@ -22,9 +22,6 @@ from tests.helpers.arm_data import free_answers, pin_tree
 from tests.helpers.robot_models import read_quietly, urdf_text
 
 ENCODER_STEP = 2 * np.pi / 2**19  # rad
-GYRO = np.radians(0.007)  # rad/s/√Hz
-ACCELEROMETER = 150e-6 * 9.81  # m/s²/√Hz
-DRAWN_KEPT = 8  # motions kept for other noise, mountings or channels
 DQ_NOISE, V_NOISE, DW_NOISE, TAU_NOISE = 1e-3, 1e-3, 0.05, 0.1  # rad/s, m/s, rad/s², N m
 
 
@@ -125,21 +122,7 @@ def anyhow(
     return tuple(mounts)
 
 
-def _seen(
-    twists: np.ndarray, accels: np.ndarray, mounts: tuple[tuple[np.ndarray, np.ndarray], ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """What sensors mounted so see of motion given in joint frames (m, bodies, 6)."""
-    twists, accels = twists.copy(), accels.copy()
-    for b, (rotation, place) in enumerate(mounts):
-        w, dw = twists[:, b, 3:].copy(), accels[:, b, 3:].copy()
-        v = twists[:, b, :3] + np.cross(w, place)
-        a = accels[:, b, :3] + np.cross(dw, place) + np.cross(w, np.cross(w, place))
-        twists[:, b] = np.concatenate([v @ rotation, w @ rotation], axis=1)
-        accels[:, b] = np.concatenate([a @ rotation, dw @ rotation], axis=1)
-    return twists, accels
-
-
-@lru_cache(DRAWN_KEPT)
+@lru_cache(8)  # kept for other noise, mountings or channels
 def _drawn(
     name: str, motion: Motion, seed: int
 ) -> tuple[tuple[np.ndarray, ...], np.random.Generator]:
@@ -168,12 +151,20 @@ def record(
     """
     (q, dq, _, tau, twists, accels), rng = copy.deepcopy(_drawn(name, motion, seed))
     model = robot(name)
-    twists, accels = _seen(twists, accels, mounts)
+    # what sensors mounted so see of motion given in joint frames (m, bodies, 6)
+    twists, accels = twists.copy(), accels.copy()
+    for b, (rotation, place) in enumerate(mounts):
+        w, dw = twists[:, b, 3:].copy(), accels[:, b, 3:].copy()
+        v = twists[:, b, :3] + np.cross(w, place)
+        a = accels[:, b, :3] + np.cross(dw, place) + np.cross(w, np.cross(w, place))
+        twists[:, b] = np.concatenate([v @ rotation, w @ rotation], axis=1)
+        accels[:, b] = np.concatenate([a @ rotation, dw @ rotation], axis=1)
     root = np.sqrt(motion.rate_hz / 2)
     q = np.round(q / ENCODER_STEP) * ENCODER_STEP
     dq = dq + noise * DQ_NOISE * rng.normal(size=q.shape)
     tau = tau + noise * TAU_NOISE * rng.normal(size=q.shape)
-    levels = [V_NOISE] * 3 + [GYRO * root] * 3, [ACCELEROMETER * root] * 3 + [DW_NOISE] * 3
+    gyro, accelerometer = np.radians(0.007) * root, 150e-6 * 9.81 * root  # of so many per √Hz
+    levels = [V_NOISE] * 3 + [gyro] * 3, [accelerometer] * 3 + [DW_NOISE] * 3
     twists = twists + noise * np.array(levels[0]) * rng.normal(size=twists.shape)
     accels = accels + noise * np.array(levels[1]) * rng.normal(size=accels.shape)
     n = model.tree.n

@@ -22,7 +22,6 @@ from tests.helpers.arm_data import Motion, arm, panda_model, pin_model, rnea, tr
 JOINTS = 6
 LOAD_KG = 3.0
 EVERY = 4  # 250 Hz
-NOISE_RAD, NOISE_RAD_S, NOISE_A = 3e-5, 3e-3, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +76,7 @@ def currents(hidden: DrivenArm, seed: int, seconds: float = 20.0, load_kg: float
     noise = (rng.normal(size=q.shape) for _ in range(3))
     signals = (
         x + level * e
-        for x, level, e in zip(
-            (q, dq, effort), (NOISE_RAD, NOISE_RAD_S, NOISE_A), noise, strict=True
-        )
+        for x, level, e in zip((q, dq, effort), (3e-5, 3e-3, 0.02), noise, strict=True)
     )
     name = "loaded" if load_kg else "bare"
     return Log(Path(f"{name}_{seed}.mcap"), arm().joint_names[:JOINTS], stamps, *signals)

@@ -21,7 +21,6 @@ COMMAND_SIZE = {5: 370, 10: 371}
 # version: (number format, its size, tau_J, tau_J_d, q, dq, generator mode, success rate)
 PLACES = {5: ("d", 1016, 1072, 1184, 1296, 2280, 2365), 10: ("f", 512, 540, 596, 652, 1288, 1373)}
 SET_COLLISION, SET_LOAD = {5: 4, 10: 3}, {5: 10, 10: 9}
-LOAD_AT = {5: 880, 10: 444}
 MOVE, STOP_MOVE, RECOVER = 1, 2, {5: 12, 10: 10}
 RUNNING = {5: 2, 10: 5}  # generator mode of a torque motion
 STARTED, NOT_POSSIBLE = 1, {5: 3, 10: 5}
@@ -48,7 +47,7 @@ def state(
     struct.pack_into("<Q", data, 0, message_id)
     for at, values in ((at_tau, tau), (at_tau_d, tau_d), (at_q, q), (at_dq, dq)):
         struct.pack_into(f"<7{number}", data, at, *values)
-    struct.pack_into(f"<13{number}", data, LOAD_AT[protocol], *load)
+    struct.pack_into(f"<13{number}", data, {5: 880, 10: 444}[protocol], *load)
     data[at_modes], data[at_modes + 1], data[at_modes + 84] = modes
     for index in errors:
         data[at_modes + 2 + index] = 1

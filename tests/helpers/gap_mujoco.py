@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 
 from drivers.files.mcap import Log
-from sim.effects import Effect
 from sim.truth import Truth, body_of
 from tests.helpers.gap_effects import (
     Array,
@@ -40,7 +39,6 @@ DRY = {
     "x_position_friction",
 }
 PUSHES = {"viscous_friction", "torque_ripple", "joint_spring"}
-FORCE = ("fx", "fy", "fz", "mx", "my", "mz")
 Push = Callable[[Array, Array, Array], Array]  # q, dq and rigid torque (n,) to torques (n,)
 
 
@@ -98,7 +96,15 @@ class Arm:
             mujoco.mj_forward(model, data)
         data, model = self._data, self._model
         data.qfrc_applied[:] = tau - self._pushes(t)
-        self._touch(t)
+        # What touches the origin of the last link
+        body, data = self._model.nbody - 1, self._data
+        data.xfrc_applied[body] = 0.0
+        for effect in (e for e in self._effects if e.name == "external_wrench" and e.acts(t)):
+            f, m = np.split(
+                np.array([effect.number(key) for key in ("fx", "fy", "fz", "mx", "my", "mz")]), 2
+            )
+            lever = data.xpos[body] - data.xipos[body]
+            data.xfrc_applied[body] += [*f, *(m + np.cross(lever, f))]
         mujoco.mj_step(model, data)
 
     def _pushes(self, t: float) -> Array:
@@ -115,7 +121,11 @@ class Arm:
                 source, j = effect.columns(n)
                 out[j] += effect.number("c") * v[source]
             elif effect.name == "bristle_friction":
-                self._bend(effect, out)
+                # Dahl's bristles, one explicit step
+                j = effect.joints[0] - 1
+                z, v = self._bristles.get(j, 0.0), float(self._data.qvel[j])
+                self._bristles[j] = z = z + H_S * (v - abs(v) * z) / effect.number("s0")
+                out[j] += effect.number("Fc") * z
             elif effect.name in DRY or effect.name in PUSHES or effect.name.startswith("x_"):
                 target = level if effect.name in DRY else out
                 for j in effect.columns(n):
@@ -124,22 +134,6 @@ class Arm:
                     target[j] += abs(torque) if effect.name in DRY else torque
         self._model.dof_frictionloss[:] = level
         return out if self._more is None else out + self._more(q, v, self._rigid)
-
-    def _bend(self, effect: Effect, out: Array) -> None:
-        """Dahl's bristles, one explicit step."""
-        j = effect.joints[0] - 1
-        z, v = self._bristles.get(j, 0.0), float(self._data.qvel[j])
-        self._bristles[j] = z = z + H_S * (v - abs(v) * z) / effect.number("s0")
-        out[j] += effect.number("Fc") * z
-
-    def _touch(self, t: float) -> None:
-        """What touches the origin of the last link."""
-        body, data = self._model.nbody - 1, self._data
-        data.xfrc_applied[body] = 0.0
-        for effect in (e for e in self._effects if e.name == "external_wrench" and e.acts(t)):
-            f, m = np.split(np.array([effect.number(key) for key in FORCE]), 2)
-            lever = data.xpos[body] - data.xipos[body]
-            data.xfrc_applied[body] += [*f, *(m + np.cross(lever, f))]
 
 
 class Controller:

@@ -32,9 +32,7 @@ TAPS, EDGE, STEP = 1001, 500, 40  # at 1 kHz: transition of 3 Hz; half a filter;
 LOWPASS = firwin(TAPS, 10.0, fs=1000.0)[:, None]
 AR_ORDER, FLOOR = 6, 1.01  # FLOOR: white noise added, where the low-pass leaves none
 BLOCK_S, BLOCKS = 2.0, 3  # every third block of 2 s is held out
-HELD_STREAM = 1 << 36
 SECOND = 1_000_000  # added to a seed for the second recording
-ITERATIONS = 4
 
 
 def smooth(x: Array) -> Array:
@@ -249,7 +247,7 @@ class Oracle:
         keep = ~self._held[AR_ORDER:]
         nuisance = self._white(self._Y)[keep].reshape(-1, m)
         y, cov = np.zeros(m), np.zeros((len(x), len(x)))
-        for _ in range(ITERATIONS if len(x) else 1):
+        for _ in range(4 if len(x) else 1):
             base = self.torque(_with(effects, x))
             steps = 1e-3 * sizes_x
             moved = (_with(effects, x + d) for d in np.diag(steps))
@@ -279,7 +277,7 @@ class Oracle:
 
 def second(trial: Trial) -> Trial:
     """The same arm, its effects at the same times, on another motion with other noise."""
-    rng = np.random.default_rng([trial.seed, HELD_STREAM])
+    rng = np.random.default_rng([trial.seed, 1 << 36])
     motion = draw_motion(rng, trial.nominal.limits, trial.nominal.ready)
     return replace(trial, motion=motion, seed=trial.seed + SECOND)
 

@@ -17,7 +17,6 @@ SHARE, STDS = 0.1, 3.0  # a parameter may be off by a tenth of its size or three
 SURE = 0.9
 SUMS = ("asymmetric_friction", "load_dependent_friction", "friction_drift")
 EVIDENCE = (0.0, 0.5, 0.9, 0.99, 1.0)  # said with less than the second it should be no name
-WHOLE_ARM = {"payload", "base_tilt", "external_wrench"}
 # Numbers that are parts of one vector are judged by its length; angles by a radian.
 VECTORS = (("cx", "cy", "cz"), ("rx", "ry"), ("fx", "fy", "fz"))
 ANGLES, SKIPPED = ("phase", "q0"), ("n", "inertia", "dtheta", "mx", "my", "mz")
@@ -36,7 +35,7 @@ def wilson(hits: int, of: int) -> tuple[float, float]:
 
 def same_joints(finding: Entry, effect: Entry) -> bool:
     """Whether both sit on the same joints; all of them counts as none named."""
-    if {finding["effect"], effect["effect"]} & WHOLE_ARM:
+    if {finding["effect"], effect["effect"]} & {"payload", "base_tilt", "external_wrench"}:
         return True
     pair = [sorted(x.get("joints") or []) for x in (finding, effect)]
     return pair[0] == pair[1] or all(len(joints) in (0, 7) for joints in pair)

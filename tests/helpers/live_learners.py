@@ -21,8 +21,6 @@ from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot
 from adapter.signals.records import stamp_of
 
-DYING_AT = 300
-
 
 def nothing_known(n: int, bodies: int, effects: int) -> Snapshot:
     """A snapshot of NaN for n joints, to be completed with `dataclasses.replace`."""
@@ -60,7 +58,7 @@ class Dying(Digest):
 
     def step(self, record) -> None:
         super().step(record)
-        if self.count == DYING_AT:
+        if self.count == 300:
             os._exit(3)
 
 

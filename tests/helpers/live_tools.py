@@ -141,6 +141,16 @@ def played(motion, stop_s, dt_s):
     return np.moveaxis(np.array(rows), 1, 0)
 
 
+def check_course(motion, course, dt_s):
+    """Assert that q, dq, ddq (m, n), every dt_s, fit together inside what the motion promises."""
+    (q, dq, ddq), (lower, upper, *most) = course, motion.bounds()
+    assert (q >= lower - 1e-9).all() and (q <= upper + 1e-9).all()
+    for rate, bound in zip((dq, ddq, np.diff(ddq, axis=0) / dt_s), most, strict=True):
+        assert (np.abs(rate) <= bound + 1e-6).all()
+    np.testing.assert_allclose(np.diff(q, axis=0) / dt_s, 0.5 * (dq[1:] + dq[:-1]), atol=2e-4)
+    np.testing.assert_allclose(np.diff(dq, axis=0) / dt_s, 0.5 * (ddq[1:] + ddq[:-1]), atol=5e-2)
+
+
 def wait_for(condition, timeout_s: float = 30.0) -> bool:
     """Whether it came true in time."""
     end = time.monotonic() + timeout_s

@@ -18,8 +18,6 @@ from drivers.files.mcap import Log
 RATE_HZ = 1000
 PERIOD_S = 20.0  # of the motion
 SINES = (2, 5, 11)  # cycles in it
-AMPLITUDE = 0.25  # rad, of the slowest sine; the others by their frequency less
-CENTRE = (0.0, -0.6, 0.0, -1.9, 0.0, 1.7, 0.7)  # rad, middle of the Panda's ranges
 VISCOUS, DRY = 0.3, 0.6  # N m s/rad, N m
 NOISE = (1e-5, 1e-3, 0.02)  # rad, rad/s, N m
 SEED = 7
@@ -65,11 +63,13 @@ def motion(seed: int = SEED) -> tuple[Array, Array, Array]:
     """q, dq, ddq (m, 7) of one period."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(PERIOD_S * RATE_HZ)) / RATE_HZ
-    q = np.tile(np.array(CENTRE), (len(t), 1))
+    centre = np.array([0.0, -0.6, 0.0, -1.9, 0.0, 1.7, 0.7])  # rad, middle of the Panda's ranges
+    q = np.tile(centre, (len(t), 1))
     dq, ddq = np.zeros_like(q), np.zeros_like(q)
     for cycles in SINES:
         w = 2.0 * np.pi * cycles / PERIOD_S
-        size = AMPLITUDE * SINES[0] / cycles * rng.uniform(0.6, 1.0, 7)
+        # rad, of the slowest sine; the others by their frequency less
+        size = 0.25 * SINES[0] / cycles * rng.uniform(0.6, 1.0, 7)
         phase = w * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, 7)
         q += size * np.sin(phase)
         dq += size * w * np.cos(phase)

@@ -10,14 +10,12 @@ from typing import TypeVar
 
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
-FIRST_WAIT_S = 60.0  # a simulated arm beside seven busy processes takes its time
-
 T = TypeVar("T")
 
 
 def patiently(action: Callable[[], T], again: Callable[[], object]) -> T:
     """What the action gives; where it raises DriverError, `again` and once more, for a while."""
-    end = time.monotonic() + FIRST_WAIT_S
+    end = time.monotonic() + 60.0  # a simulated arm beside seven busy processes takes its time
     while True:
         try:
             return action()

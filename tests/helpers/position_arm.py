@@ -24,7 +24,6 @@ from sim.truth import Array, Truth, documented
 from tests.hidden.motion import draw_motion
 
 TICK_S, STEPS = 1e-3, 8  # commands act at ticks; steps of a tick
-CREEP_M_S = 2e-3  # of a hand that friction on the table holds
 SETTLE_S = 1.0  # at the first command before the recording begins
 
 
@@ -199,7 +198,7 @@ def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> Non
             force = body.table[4] * max(body.table[3] - pose[2, 3], 0.0)
             along = J[:2] @ middle
             fast = np.hypot(along[0], along[1])
-            drag = body.table[5] * force * np.tanh(fast / CREEP_M_S) / max(fast, 1e-9)
+            drag = body.table[5] * force * np.tanh(fast / 2e-3) / max(fast, 1e-9)
             drive += J[2] * force - drag * (along @ J[:2])
         way, rests, rubs = np.sign(dq), dq == 0.0, dry_friction(joints, middle * (dq != 0.0))
         ddq = np.zeros(n)

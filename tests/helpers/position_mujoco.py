@@ -10,7 +10,6 @@ from adapter.model.mjcf_drives import SPEED
 from drivers.files.mcap import Log
 
 Array = NDArray[np.float64]
-JUDGED_S = 0.5  # readings from there on, as of our own simulation
 
 
 def followed(model: mujoco.MjModel, log: Log, start: Array) -> Array:
@@ -49,5 +48,6 @@ def followed(model: mujoco.MjModel, log: Log, start: Array) -> Array:
 def error_in_mujoco(text: str, log: Log, start: Array) -> Array:
     """(n,) rad, rms of the readings less those of MuJoCo stepping an MJCF text."""
     model = mujoco.MjModel.from_xml_string(text)
-    left = (log.q - followed(model, log, start))[log.stamp_ns - log.stamp_ns[0] >= 1e9 * JUDGED_S]
+    judged = log.stamp_ns - log.stamp_ns[0] >= 0.5e9  # s, as of our own simulation
+    left = (log.q - followed(model, log, start))[judged]
     return np.sqrt(np.mean(left**2, axis=0))

@@ -15,7 +15,6 @@ from sim.falls.fall import BASE, TreeTruth
 from sim.truth import Array, Limits, theta_of, turn
 
 MOST_JOINTS = 30
-ANY_ANGLE = 0.25  # share of frames that stand at any angle; the others at right angles
 NO_OFFSET, ALONG_AN_AXIS = 0.2, 0.5  # shares of origins
 
 
@@ -36,7 +35,7 @@ def cad_tree(seed: int, joints: int | None = None) -> SelfModel:
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
-    if rng.random() < ANY_ANGLE:
+    if rng.random() < 0.25:  # stand at any angle; the others at right angles
         return exp_rotation(rng.uniform(0.0, np.pi) * _direction(rng))
     quarter = 0.5 * np.pi * rng.integers(0, 4, 3)
     return rot_z(quarter[0]) @ rot_y(quarter[1]) @ rot_x(quarter[2])
@@ -59,8 +58,6 @@ def _offset(rng: np.random.Generator) -> np.ndarray:
 GRAVITY = (0.0, 0.0, -9.81)  # m/s², world axes
 NEAR = 16  # a random tree's link hangs on one of so many before it: chains as well as branches
 REACH_M = 0.12  # rms distance between two joints of a random tree, per axis
-DENSITY = 1000.0  # kg/m³, of the boxes that random links are made of (water; robots are close)
-SHORTEST_M, LONGEST_M = 0.05, 0.2  # edges of those boxes
 RANGE_RAD, SPEED, EFFORT = (0.8, 2.0), 12.0, 1000.0  # rad, rad/s, N m: ATLAS has the like
 
 
@@ -92,8 +89,8 @@ def random_tree(links: int, seed: int) -> TreeTruth:
 
 def _random_body(rng: np.random.Generator) -> Array:
     """(10,) of a box of random size, place and orientation."""
-    edges = rng.uniform(SHORTEST_M, LONGEST_M, 3)
-    m = DENSITY * float(np.prod(edges))
+    edges = rng.uniform(0.05, 0.2, 3)  # m
+    m = 1000.0 * float(np.prod(edges))  # of water; robots are close
     axes = _any_rotation(rng)
     square = edges * edges
     inertia = axes @ np.diag(m / 12 * (square.sum() - square)) @ axes.T

@@ -186,7 +186,17 @@ def pinocchio_case(text: str, floating: bool, samples: int = 5, seed: int = 1) -
     signals, motions, torques, bases = [], [], [], []
     for _ in range(samples):
         q, dq, ddq = rng.uniform(-3, 3, model.tree.n), *rng.normal(size=(2, model.tree.n)) * 2
-        full = _configuration(oracle, model, q, dq, ddq, rng)
+        # Pinocchio's q, v, a; the base in random motion where it floats
+        full_q, full_v, full_a = pin.neutral(oracle), np.zeros(oracle.nv), np.zeros(oracle.nv)
+        if model.tree.floating:
+            quaternion = rng.normal(size=4)
+            full_q[:3], full_q[3:7] = rng.normal(size=3), quaternion / np.linalg.norm(quaternion)
+            full_v[:6], full_a[:6] = rng.normal(size=6), rng.normal(size=6) * 3
+        names = model.tree.joint_names
+        set_angles(oracle, full_q, names, q)
+        places = places_of(oracle, names)
+        full_v[places], full_a[places] = dq, ddq
+        full = full_q, full_v, full_a
         data = oracle.createData()
         pin.forwardKinematics(oracle, data, *full)
         gravity = oracle.gravity.linear
@@ -214,20 +224,6 @@ def pin_model(text: str, floating: bool = False) -> pin.Model:
     if floating:
         return pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
     return pin.buildModelFromXML(text)
-
-
-def _configuration(oracle, model, q, dq, ddq, rng):  # type: ignore[no-untyped-def]
-    """Pinocchio's q, v, a; the base in random motion where it floats."""
-    full_q, full_v, full_a = pin.neutral(oracle), np.zeros(oracle.nv), np.zeros(oracle.nv)
-    if model.tree.floating:
-        quaternion = rng.normal(size=4)
-        full_q[:3], full_q[3:7] = rng.normal(size=3), quaternion / np.linalg.norm(quaternion)
-        full_v[:6], full_a[:6] = rng.normal(size=6), rng.normal(size=6) * 3
-    names = model.tree.joint_names
-    set_angles(oracle, full_q, names, q)
-    places = places_of(oracle, names)
-    full_v[places], full_a[places] = dq, ddq
-    return full_q, full_v, full_a
 
 
 def set_angles(oracle, full, names, angles) -> None:  # type: ignore[no-untyped-def]

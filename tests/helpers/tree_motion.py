@@ -6,7 +6,6 @@ import numpy as np
 import pinocchio as pin
 
 from adapter.learning.tree_data import BodyMotion, TreeData
-from adapter.model.self_model import SelfModel
 from adapter.model.spatial import z_to_axis
 from adapter.model.urdf import model_from_urdf
 from tests.helpers.robot_models import (
@@ -17,23 +16,6 @@ from tests.helpers.robot_models import (
     set_angles,
     text_of,
 )
-
-FREQUENCIES_HZ = (0.15, 0.9)
-WIDEST_RAD = 0.9  # swing of a joint without narrow limits
-
-
-def joint_motion(model: SelfModel, t: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
-    """q, dq, ddq (m, n): three sines a joint, inside its limits."""
-    rng = np.random.default_rng(seed)
-    n = model.tree.n
-    lower, upper = (np.clip(x, -np.pi, np.pi) for x in (model.limits.lower, model.limits.upper))
-    middle, half = 0.5 * (lower + upper), np.minimum(0.45 * (upper - lower), WIDEST_RAD)
-    size = rng.dirichlet(np.ones(3), n) * half[:, None]
-    omega = 2 * np.pi * rng.uniform(*FREQUENCIES_HZ, (n, 3))
-    angle = omega * t[:, None, None] + rng.uniform(0, 2 * np.pi, (n, 3))
-    q = middle + (size * np.sin(angle)).sum(axis=2)
-    dq = (size * omega * np.cos(angle)).sum(axis=2)
-    return q, dq, -(size * omega**2 * np.sin(angle)).sum(axis=2)
 
 
 def in_motion(text: str, floating: bool, seconds: float, seed: int, rate_hz: float = 1e3) -> tuple:
@@ -49,7 +31,16 @@ def in_motion(text: str, floating: bool, seconds: float, seed: int, rate_hz: flo
         oracle.gravity = pin.Motion.Zero()
     gravity, n = oracle.gravity.linear.copy(), model.tree.n
     dt, m = 1.0 / rate_hz, round(seconds * rate_hz)
-    q, dq, ddq = joint_motion(model, dt * np.arange(m), seed)
+    # q, dq, ddq (m, n): three sines a joint, inside its limits
+    rng = np.random.default_rng(seed)
+    lower, upper = (np.clip(x, -np.pi, np.pi) for x in (model.limits.lower, model.limits.upper))
+    middle, half = 0.5 * (lower + upper), np.minimum(0.45 * (upper - lower), 0.9)  # rad
+    size = rng.dirichlet(np.ones(3), n) * half[:, None]
+    omega = 2 * np.pi * rng.uniform(0.15, 0.9, (n, 3))
+    angle = omega * (dt * np.arange(m))[:, None, None] + rng.uniform(0, 2 * np.pi, (n, 3))
+    q = middle + (size * np.sin(angle)).sum(axis=2)
+    dq = (size * omega * np.cos(angle)).sum(axis=2)
+    ddq = -(size * omega**2 * np.sin(angle)).sum(axis=2)
     names = model.tree.joint_names
     numbers = [oracle.getJointId(name) for name in names]
     turns = [z_to_axis(axis) for axis in model.axis]

@@ -43,7 +43,6 @@ from tests.helpers.arm_data import Motion, panda_model, record, rubbing
 from tests.helpers.gap_effects import regressor
 from tests.helpers.robot_models import entry
 
-DAY_NS = 86_400 * 10**9
 # The log with a load; joint (from 1) whose friction grows; another arm.
 LOADED, WORN, OTHER = 2, 3, 6
 LOGS, MASS, WEAR = 6, 1.2, 0.05  # N m s/rad a day
@@ -62,7 +61,7 @@ def truth_on(day: int) -> Truth:
 
 def write(path: Path, truth: Truth, day: int, arm: str | None = None, seconds: float = 8.0) -> Path:
     data = record(truth, Motion(seconds, 50 + day))
-    log = replace(data.log(), stamp_ns=day * DAY_NS + data.stamp_ns + 1)
+    log = replace(data.log(), stamp_ns=day * 86_400 * 10**9 + data.stamp_ns + 1)
     write_log(log, path, {} if arm is None else {"serial": arm})
     return path
 

@@ -43,7 +43,6 @@ from drivers.interface import DriverError
 FORMAT = 2  # of the files of moments; another one is computed anew
 EPOCH_S = 1e9  # stamps below are no dates: a clock that counts from its start
 SEEN, FOLDER, GONE = "seen.jsonl", "moments", ".forgotten"
-ARM_KEYS = ("arm", "serial", "serial_number", "robot_serial", "arm_id")  # in a log's metadata
 
 
 class Task(NamedTuple):
@@ -205,7 +204,8 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
 def arm_named(metadata: dict[str, Any]) -> str | None:
     """Name or serial number of the arm that a recording tells, if it does."""
     entries = (metadata, *(x for x in metadata.values() if isinstance(x, dict)))
-    told = (entry.get(key) for entry in entries for key in ARM_KEYS)
+    keys = "arm", "serial", "serial_number", "robot_serial", "arm_id"
+    told = (entry.get(key) for entry in entries for key in keys)
     return next(filter(None, (str(x).strip() for x in told if isinstance(x, str | int))), None)
 
 

@@ -374,22 +374,18 @@ class McapOfAnyRos(McapScan):
             # A file repeats its channels in each chunk, so their telling is put right each time.
             for number in numbers:
                 self._tell_as_cdr(number)
-            packed = self._packed(region)
+            # (k,) which messages of known types are packed one by one, as rosbag2 can
+            packed = np.zeros(len(region.start), bool)
+            long = np.flatnonzero(region.stop - region.start > len(_ZSTD))
+            begin = region.rows(region.start[long], len(_ZSTD))
+            packed[long] = (begin == np.frombuffer(_ZSTD, np.uint8)).all(axis=1)
+            if packed.any():
+                known = [n for n, c in self.channels.items() if schema_name(self, c) in PARSERS]
+                packed &= np.isin(region.channel, known)
             if packed.any() or any(number in self._from_ros1 for number in numbers):
                 yield from _regions(self._told(region, packed))
             else:
                 yield region
-
-    def _packed(self, region: Region) -> NDArray[np.bool_]:
-        """(k,) which messages of known types are packed one by one, as rosbag2 can."""
-        packed = np.zeros(len(region.start), bool)
-        long = np.flatnonzero(region.stop - region.start > len(_ZSTD))
-        begin = region.rows(region.start[long], len(_ZSTD))
-        packed[long] = (begin == np.frombuffer(_ZSTD, np.uint8)).all(axis=1)
-        if packed.any():
-            known = [n for n, c in self.channels.items() if schema_name(self, c) in PARSERS]
-            packed &= np.isin(region.channel, known)
-        return packed
 
     def _tell_as_cdr(self, number: int) -> None:
         channel = self.channels.get(number)

@@ -369,7 +369,14 @@ class McapScan(Scan):
         """Its messages; of a cut one what can be had, and no checksum holds it to anything."""
         cut = stop > self.size
         try:
-            chunk = self._chunk_at(at)
+            # its bytes are not copied; of a cut one there are as many as there are
+            begin, end, size, crc, length = _CHUNK_HEAD.unpack_from(self._data, at + HEAD)
+            name_at = at + HEAD + _CHUNK_HEAD.size
+            name = str(self._data[name_at : name_at + length], "utf-8")
+            (stored,) = _LENGTH.unpack_from(self._data, name_at + length)
+            first = name_at + length + _LENGTH.size
+            data: Any = self._data[first : first + stored]
+            chunk = Chunk(name, data, end, begin, crc, size)
             size = chunk.uncompressed_size
             if size > CHUNK_LIMIT:
                 raise DamagedChunk(f"it claims {size} bytes, at most {CHUNK_LIMIT} are read")
@@ -387,16 +394,6 @@ class McapScan(Scan):
             return
         self._rescued = len(found.start) if cut else 0
         yield from self._use(found, content)
-
-    def _chunk_at(self, at: int) -> Chunk:
-        """The chunk there, whose bytes are not copied; of a cut one as many as there are."""
-        begin, end, size, crc, length = _CHUNK_HEAD.unpack_from(self._data, at + HEAD)
-        name_at = at + HEAD + _CHUNK_HEAD.size
-        name = str(self._data[name_at : name_at + length], "utf-8")
-        (stored,) = _LENGTH.unpack_from(self._data, name_at + length)
-        first = name_at + length + _LENGTH.size
-        data: Any = self._data[first : first + stored]
-        return Chunk(name, data, end, begin, crc, size)
 
     def _warn(self, sentence: str) -> None:
         if len(self.warnings) < _MOST_WARNINGS:

@@ -56,10 +56,6 @@ def _qos(history: int, depth: int, durability: int) -> str:
     return f"{lines}{spans}  liveliness: 1\n  avoid_ros_namespace_conventions: false\n"
 
 
-LATCHED_QOS = _qos(history=1, depth=1, durability=1)  # keep last, reliable, transient local
-STREAM_QOS = _qos(history=1, depth=10, durability=2)  # keep last, reliable, volatile
-
-
 def to_json(value: Any) -> str:
     """JSON of numbers, texts, arrays and mappings of them; not-a-number becomes null."""
     return json.dumps(_plain(value), allow_nan=False)
@@ -250,7 +246,8 @@ class McapWriter:
             if schema not in self._schemas:
                 text = schemas()[schema].encode()
                 self._schemas[schema] = self._writer.register_schema(schema, "ros2msg", text)
-            offered = {"offered_qos_profiles": LATCHED_QOS if latched else STREAM_QOS}
+            depth, durability = (1, 1) if latched else (10, 2)  # transient local, or volatile
+            offered = {"offered_qos_profiles": _qos(1, depth, durability)}
             of = self._schemas[schema]
             number = self._writer.register_channel(topic, "cdr", of, offered)
             self._channels[topic] = number
