@@ -98,6 +98,7 @@ class Belief:
         gain = np.linalg.solve(self.H[at, at], np.c_[self.H[at, rest], self.rhs[at]])
         cross = self.H[np.ix_(rest, np.arange(size)[at])]
         self.rhs, self.drift = self.rhs[rest] - cross @ gain[:, -1], self.drift[rest]
+        self._floor = self._floor[rest[rest < len(self._floor)]]
         self.H = self.H[np.ix_(rest, rest)] - cross @ gain[:, :-1]
         self._mean = None
 
@@ -111,8 +112,6 @@ class RowGroup:
         Z: (r, n, D) regressor and columns of the learned effects.
         S: (r, n, K) signatures; tau: (r, n) N m.
         unsure: (r, n) variance that no model of these rows can do without, (N m)².
-        rates: (r, 2 n) velocities and accelerations, rad/s and rad/s².
-        new: (r, n) 1 where one of a joint's is beyond what the belief has seen, else 0.
     """
 
     t: Array
@@ -120,13 +119,6 @@ class RowGroup:
     S: Array
     tau: Array
     unsure: Array
-    rates: Array
-    new: Array
-
-    @property
-    def doubt(self) -> Array:
-        """(r, n) `unsure`, and all but infinite where the belief foretells nothing, (N m)²."""
-        return self.unsure + 1e12 * self.new  # (N m)²
 
     @classmethod
     def joined(cls, groups: Sequence[RowGroup]) -> RowGroup:
