@@ -1,11 +1,10 @@
 """A light watch over the residual while an arm is learned: what is new, where, since when.
 
 It runs beside the learner, on the states the learner sees, at 25 rows a second. Once θ has seen
-three seconds it takes over the posterior, as wide as the motion leaves it under held priors. It
-keeps a belief of its own from then on, which takes in rows only when they are two seconds old:
-what begins meanwhile is judged against a model that has not learned it yet. A disagreement that
-was reported stays in the belief with its own coefficients, so it is reported once, its size
-becomes better, and it does not spoil the rest.
+three seconds it takes over what the learner knows and keeps a belief of its own from then on,
+which takes in rows only when they are two seconds old: what begins meanwhile is judged against a
+model that has not learned it yet. A disagreement that was reported stays in the belief with its
+own coefficients, so it is reported once, its size becomes better, and it does not spoil the rest.
 An arm at rest shows nothing: the front end passes on states of motion only.
 """
 
@@ -23,12 +22,14 @@ from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList, sentence
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.judgement.noise import LEAST_NM
+from adapter.learning.change import extremes, is_new
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
 
 BLOCK_NS = 40_000_000  # states averaged to one row
+TRUST = 4.0  # the learner's information counts one in so many
 STRIBECK_SPEEDS = (0.03, 0.1)  # rad/s; between them, static friction's shape is a sum of theirs
 DRIFT = 0.2  # of friction: no law of it is better from one move to the next
 
@@ -163,11 +164,18 @@ class Monitor:
                     self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
     def _take_over(self, learner: OnlineLearner) -> None:
-        """Start from the posterior; a motion one way leaves friction and offset in doubt."""
+        """Start from what the learner knows."""
         theta, n, self._changes = learner.theta, self._n, len(learner.changes)
-        known = learner.posterior(bounded=False)
-        H = np.asarray(np.linalg.inv(known.joint))
-        self._belief, self._size = Belief(H, H @ known.mean), len(H)
+        H, rhs = theta.information()
+        if theta.spare_in_use:  # it stands behind the last link, whose place it takes
+            before = Belief(H, rhs)
+            before.drop(slice(10 * n - 10, 10 * n))
+            H, rhs = before.H, before.rhs
+        else:
+            rest = np.r_[: 10 * n, 10 * n + 10 : len(rhs)]
+            H, rhs = H[np.ix_(rest, rest)], rhs[rest]
+        self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
+        self._rates = extremes(learner.rates_seen)
         rubs = [x.band > 0.0 or x is CATALOGUE["viscous_friction"] for x in theta.effects]
         squares = self._squares()
         self._belief.drift[10 * n :] = DRIFT**2 * (np.array(rubs)[:, None] * squares).ravel()
@@ -209,7 +217,9 @@ class Monitor:
         # those of a second tell then as much as one
         held = np.square(slowness(slowest)) * learner.theta.banded(self._squares())
         unsure = np.where(slowest < SMOOTHING_DQ, 1e9 / BLOCK_NS, 1.0) * held
-        return RowGroup(t, Z, signatures, tau - tool, unsure)
+        rates = np.hstack([dq, ddq])
+        new = is_new(rates, self._rates).astype(float)
+        return RowGroup(t, Z, signatures, tau - tool, unsure, rates, new)
 
     def _absorb(self, group: RowGroup) -> None:
         """Learn from a group that left the window, and its noise."""
@@ -222,3 +232,5 @@ class Monitor:
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), keep=1.0 - 0.2 / 120.0)
         self._found.forget_before(float(group.t[0]), self._belief)
+        further = extremes(np.concatenate([self._rates, group.rates]))
+        self._rates += 0.2 * (further - self._rates)  # seen, a new rate is known after a second

@@ -112,6 +112,8 @@ class RowGroup:
         Z: (r, n, D) regressor and columns of the learned effects.
         S: (r, n, K) signatures; tau: (r, n) N m.
         unsure: (r, n) variance that no model of these rows can do without, (N m)².
+        rates: (r, 2 n) velocities and accelerations, rad/s and rad/s².
+        new: (r, n) 1 where one of a joint's is beyond what the belief has seen, else 0.
     """
 
     t: Array
@@ -119,6 +121,13 @@ class RowGroup:
     S: Array
     tau: Array
     unsure: Array
+    rates: Array
+    new: Array
+
+    @property
+    def doubt(self) -> Array:
+        """(r, n) `unsure`, and all but infinite where the belief foretells nothing, (N m)²."""
+        return self.unsure + 1e12 * self.new  # (N m)²
 
     @classmethod
     def joined(cls, groups: Sequence[RowGroup]) -> RowGroup:

@@ -354,8 +354,8 @@ class OnlineLearner:
         blank[:, self.layout.tau] = 0.0
         return -self.theta.errors(self.frames, blank)
 
-    def posterior(self, bounded: bool = True) -> LearnedPosterior:
-        """What is known of θ and the effects by all states so far, see `learned_posterior`."""
+    def posterior(self) -> LearnedPosterior:
+        """What is known of θ and the effects by all states so far."""
         rows = np.arange(max(self._held_from, self._held_to - 5000), self._held_to)  # newest
         held, memory = self._held[rows % len(self._held)], None
         if len(held) > 1:
@@ -363,7 +363,7 @@ class OnlineLearner:
             memory = memory_s(self.theta.errors(self.frames, held)[:, -self.tree.n :], apart_s)
         # what is counted as a sample: a state, or (in moments from elsewhere) an independent one
         period_s = self._filtered.state_s * self._filtered.noise_gain / self.theta.noise_gain
-        return learned_posterior(self.theta, self.documented, period_s, memory, bounded)
+        return learned_posterior(self.theta, self.documented, period_s, memory)
 
     def without_known(self, table: Array) -> Array:
         """Filtered states (m, size), which follow those before, without known effects."""

@@ -29,7 +29,7 @@ class LearnedPosterior(NamedTuple):
         held: what the hand carries beside the documented arm from the first sample on.
         payload: what a change at the hand brought; None without one.
         covariance: (10 bodies, 10 bodies) of θ in use as ADAM has it, its noise with memory.
-        mean, joint: (10 n + e n,) the links' θ with what the hand carries, and effects; covariance.
+        joint: (10 n + e n, 10 n + e n) of the links' θ with what the hand carries, and of effects.
     """
 
     effects: Array
@@ -37,16 +37,11 @@ class LearnedPosterior(NamedTuple):
     held: Load
     payload: Load | None
     covariance: Array
-    mean: Array
     joint: Array
 
 
 def learned_posterior(
-    theta: Theta,
-    documented: Array | None,
-    period_s: float,
-    memory_s: Array | None,
-    bounded: bool = True,
+    theta: Theta, documented: Array | None, period_s: float, memory_s: Array | None
 ) -> LearnedPosterior:
     """Judge the moments of θ and the effects beside it.
 
@@ -58,7 +53,6 @@ def learned_posterior(
             begins with, and no load before a change, where None.
         period_s: that one sample of the moments stands for.
         memory_s: (n,) of the noise; the shortest where nobody has seen it.
-        bounded: friction and motors are not below zero; else what is known is all of one Gaussian.
     """
     n, spare = theta.tree.n, theta.spare_in_use
     links, effects = slice(20, 20 + 10 * n), slice(20 + 10 * n, None)
@@ -76,7 +70,7 @@ def learned_posterior(
     start[links], start[effects] = bodies.ravel(), np.nan_to_num(theta.believed[0]).ravel()
     positive = np.zeros(len(std), dtype=bool)
     above = np.array([x.key in x.positive for x in theta.effects], dtype=bool)
-    positive[effects] = bounded & ~told.ravel() & np.repeat(above, n)
+    positive[effects] = ~told.ravel() & np.repeat(above, n)
 
     # the learner's parameters by these: of the links, of the spare body in the hand's place
     way, hand = np.zeros((theta.P, len(std))), theta.hand
@@ -108,7 +102,6 @@ def learned_posterior(
         (x[:10], covariance[:10, :10]),
         (x[10:20], covariance[10:20, 10:20]) if spare else None,
         theta.covariance()[np.ix_(in_use, in_use)] / worth,
-        whole @ x,
         whole @ covariance @ whole.T,
     )
 

@@ -14,12 +14,12 @@ from adapter.gap.monitor_judge import sentence
 from adapter.physics.rigid_arm import RigidArm
 from adapter.realtime.run_messages import RunMessages
 from adapter.runs.config import PipelineSettings
+from adapter.runs.outcome import collect
 from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import StateLayout
 from drivers.files.estimates import EstimateNames
 from sim.scenarios import build
-from tests.benchmarks.live_trials import run
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
 from tests.hidden.sizes import draw_bristles
 
@@ -148,7 +148,11 @@ def test_a_load_that_the_learner_saw_before_the_watch_began_is_told_once() -> No
 
 @pytest.mark.parametrize(
     ("kind", "effects"),
-    [("friction", ()), ("friction", ("coulomb_friction",)), ("bristles", REAL_ARM_EFFECTS)],
+    [
+        ("friction", ()),
+        ("friction", ("coulomb_friction", "viscous_friction")),
+        ("bristles", REAL_ARM_EFFECTS),
+    ],
 )
 @pytest.mark.parametrize("seed", QUIET[:2])
 def test_friction_that_was_always_there_is_not_new(
@@ -188,6 +192,12 @@ def test_a_replay_reports_and_a_batch_does_not_watch() -> None:
     assert batch.disagreements is None
 
 
+def test_without_a_monitor_nothing_is_claimed() -> None:
+    learner = learner_for(seed=1)
+    learner.step_table(states_of(disturbed("nothing", 20))[:ROWS])
+    assert collect(learner).disagreements is None
+
+
 def test_within_a_window_friction_differs_by_its_drift_and_no_more_is_known() -> None:
     """Covariances add, whatever else is known: by the inverse of their sum."""
     root = np.random.default_rng(3).normal(size=(4, 4))
@@ -198,12 +208,6 @@ def test_within_a_window_friction_differs_by_its_drift_and_no_more_is_known() ->
     belief.drop(slice(3, 4))  # what was known of the others goes on to fade
     belief.absorb(np.eye(3), np.ones(3), np.zeros(3), keep=0.5)
     assert np.isfinite(belief.std()).all()
-
-
-def test_what_slow_motion_leaves_unknown_hides_no_load() -> None:
-    """0.2 kg at the first fast move of three joints; a mask over what is new had hidden it."""
-    found = run(72102)
-    assert not found["false"] and found["late_s"] < 2.0
 
 
 def test_a_hole_ends_a_block() -> None:
