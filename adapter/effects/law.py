@@ -18,6 +18,7 @@ import numpy as np
 from adapter.effects import base as base
 from adapter.effects.base import Array, JointSignals, Values
 from adapter.effects.phrases import SPEEDS, STILL, TURN, Phrase
+from adapter.model.urdf_text import CUBIC_DRAG, DRAG, NO_PLACE, Additions
 
 LAW, AT = "law: ", " at "  # begins the name of a law that has no other; goes before its setting
 LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting
@@ -83,6 +84,7 @@ class Expression:
         term: of the signals and the setting, where there is one.
         setting: that it has.
         drags: whether it is friction by speed alone, which takes energy or is none.
+        place: what a joint of a robot's file calls it (`urdf_text`), if it has a name for it.
     """
 
     text: str
@@ -90,6 +92,7 @@ class Expression:
     term: Callable[[JointSignals, Array], Array]
     setting: Setting | None = None
     drags: bool = False
+    place: str = NO_PLACE
 
     @property
     def unit(self) -> str:
@@ -119,8 +122,8 @@ def _power(at: JointSignals, p: Array) -> Array:
 def _grammar() -> tuple[Expression, ...]:
     """Every expression that is tried."""
     out = [
-        Expression("dq |dq|", {"dq": 2}, lambda at, _: at.dq * np.abs(at.dq), drags=True),
-        Expression("dq³", {"dq": 3}, lambda at, _: at.dq**3, drags=True),
+        Expression("dq |dq|", {"dq": 2}, lambda at, _: at.dq * np.abs(at.dq), None, True, DRAG),
+        Expression("dq³", {"dq": 3}, lambda at, _: at.dq**3, None, True, CUBIC_DRAG),
         Expression("|dq|", {"dq": 1}, lambda at, _: np.abs(at.dq)),
         Expression("dq²", {"dq": 2}, lambda at, _: at.dq**2),
         Expression("sign(dq) |dq|^p", {}, _power, POWER, drags=True),
@@ -195,6 +198,7 @@ class Law(OverSignals):
         self.variables = frozenset(re.findall(r"ddq|dq|tau|q", expression.text))
         self.by_load = "tau" in self.variables  # type: ignore[misc]
         self.positive = ("c",) if expression.drags else ()  # type: ignore[misc]
+        self.place = expression.place  # type: ignore[misc]
         self.turns = bool(setting and setting.wave)  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
         own = [base.Parameter("c", expression.unit)]
@@ -237,6 +241,10 @@ class Law(OverSignals):
             lambda x: {"c": float(x[0]), key: max(middle + float(x[1]), lower)},
             linear=False,
         )
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """c, in the place that a joint has for it."""
+        return more.at_joint(self.place, joint, values["c"])
 
     def learned_from(self, values: Values) -> dict[str, float]:
         """c, of the law at its setting, if it is learned."""

@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike
 
 from adapter.effects.active import Active, active_effects, check_effects
 from adapter.effects.catalogue import CATALOGUE, KNOWN
+from adapter.effects.law import LAWS
 from adapter.model.filled import MJCF_PLACES, PLACES, filled
 from adapter.model.mjcf import mjcf_onto, read_mjcf
 from adapter.model.robots import documented
 from adapter.model.self_model import MJCF, SelfModel, gravity_down, theta_doubt
 from adapter.model.tree import Tree
 from adapter.model.urdf import file_text, urdf_onto
-from adapter.model.urdf_text import NO_PLACE, STIFFNESS, Additions, Kept
+from adapter.model.urdf_text import CUBIC_DRAG, DRAG, NO_PLACE, STIFFNESS, Additions, Kept
 from adapter.model.usd import usd_onto
 from adapter.model.xml_edit import XmlText
 
@@ -49,7 +50,7 @@ def read_robot(
 def _effects(joints: Sequence[dict[str, float]]) -> tuple[dict[str, Any], ...]:
     """Entries of a model file for what MuJoCo's joints have."""
     found = []
-    for effect in CATALOGUE.values():
+    for effect in (*CATALOGUE.values(), *LAWS.values()):
         key = MJCF_PLACES.get(effect.place, "")
         having = [j for j, joint in enumerate(joints) if key in joint]
         if having:
@@ -138,9 +139,12 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
         if not Path(onto).exists():
             notes = [f"{onto}, which the model came from, is not there; this is the arm alone"]
             onto = None
+    if more.joint[DRAG].any() or more.joint[CUBIC_DRAG].any():
+        notes.append("damping with a polynomial, which MuJoCo reads from version 4 on")
     if onto is None:
         return _with_head(model, more, "mjcf", filled("mjcf", model, more), notes)
-    return _with_head(model, more, "mjcf", *mjcf_onto(model, more, onto), str(onto))
+    text, said = mjcf_onto(model, more, onto)
+    return _with_head(model, more, "mjcf", text, [*notes, *said], str(onto))
 
 
 def robot_text(

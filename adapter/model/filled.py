@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from adapter.model import urdf_text as texts
 from adapter.model.inertia import body_from_theta
@@ -21,6 +22,8 @@ from adapter.model.urdf_text import Additions, as_file, number_text, six_named
 # MuJoCo's names of what a joint has: <joint damping=... frictionloss=... armature=...>.
 MJCF_PLACES = {texts.DAMPING: "damping", texts.FRICTION: "frictionloss", texts.ARMATURE: "armature"}
 MJCF_PLACES[texts.STIFFNESS] = "stiffness"
+# MuJoCo 4 has damping as a polynomial, (b0 + b1 |dq| + b2 dq²) dq, of which these are the last two.
+MJCF_PLACES |= {texts.DRAG: texts.DRAG, texts.CUBIC_DRAG: texts.CUBIC_DRAG}
 PLACES = {  # of what joints have beside, by format, which is what its template is called
     "urdf": (texts.DAMPING, texts.FRICTION),
     "mjcf": tuple(MJCF_PLACES),
@@ -40,8 +43,9 @@ def _environment() -> Any:
         undefined=StrictUndefined,
         trim_blocks=True,
     )
-    own: dict[str, Any] = {"n": number_text, "six": six_named, "mjcf": joint_attributes}
+    own: dict[str, Any] = {"n": number_text, "six": six_named}
     own |= {"quat": quaternion_from_matrix, "rpy": rpy_from_matrix, "degree": math.pi / 180.0}
+    own["mjcf"] = lambda more, joint: as_written(joint_attributes(more, joint))
     own["quoted"] = lambda name: repr(re.escape(name))
     own["id"] = lambda name: re.sub(r"^(?=\d)|\W", "_", name, flags=re.ASCII)  # as USD takes one
     environment.globals |= own
@@ -109,6 +113,15 @@ def joint_attributes(more: Additions, joint: int) -> dict[str, float]:
     if own.get("stiffness"):  # -stiffness (q - springref) is what MuJoCo adds
         own["springref"] = float(more.pull[joint] / -own["stiffness"])
     return own
+
+
+def as_written(own: dict[str, float]) -> dict[str, ArrayLike]:
+    """What a joint has beside, as an MJCF has it: damping with its polynomial in one."""
+    drags = [own.get(place, 0.0) for place in (texts.DRAG, texts.CUBIC_DRAG)]
+    out: dict[str, ArrayLike] = dict(own)
+    for place in (texts.DRAG, texts.CUBIC_DRAG):
+        out.pop(place, None)
+    return out | ({"damping": [own.get("damping", 0.0), *drags]} if any(drags) else {})
 
 
 def principal(tensor: Array) -> tuple[Array, Array]:

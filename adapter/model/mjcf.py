@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike
 from adapter import optional
 from adapter.errors import ModelError, ModelWarning
 from adapter.model import spatial
-from adapter.model.filled import MJCF_PLACES, joint_attributes, principal
+from adapter.model.filled import MJCF_PLACES, as_written, joint_attributes, principal
 from adapter.model.inertia import body_from_theta, move_theta, theta_from_body
 from adapter.model.onto import Changes, changes_onto
 from adapter.model.robot_file import FileJoint, FileRobot, Merged
 from adapter.model.self_model import MJCF, SelfModel, Source
 from adapter.model.urdf import file_text
-from adapter.model.urdf_text import STIFFNESS, Additions, number_text
+from adapter.model.urdf_text import CUBIC_DRAG, DRAG, STIFFNESS, Additions, number_text
 from adapter.model.xml_edit import Element, XmlText
 
 KINDS = ("floating", "ball", "prismatic", "revolute")  # of joints, by MuJoCo's numbers
@@ -50,7 +50,7 @@ def read_mjcf(
 
     Returns:
         The model, and by joint what MuJoCo calls armature, damping, frictionloss, stiffness and
-        springref, where not zero.
+        springref, and its damping's polynomial by `filled.MJCF_PLACES`, where not zero.
 
     Raises:
         ModelError: one sentence naming the file, the element and the choices.
@@ -185,7 +185,10 @@ class MjcfFile:
     def extras(self, name: str) -> dict[str, float]:
         """What a joint has beside the rigid arm, by MuJoCo's names; zeros left out."""
         joint = self.compiled.joint(self._numbers[name])
-        out = {key: float(np.ravel(getattr(joint, key))[0]) for key in MJCF_PLACES.values()}
+        polynomial = np.ravel(getattr(joint, "dampingpoly", (0.0, 0.0)))  # before MuJoCo 4 none
+        out = dict(zip((DRAG, CUBIC_DRAG), map(float, polynomial), strict=True))
+        plain = [key for key in MJCF_PLACES.values() if key not in out]
+        out |= {key: float(np.ravel(getattr(joint, key))[0]) for key in plain}
         if out[MJCF_PLACES[STIFFNESS]]:
             out["springref"] = float(self.compiled.qpos_spring[joint.qposadr[0]])
         return {key: value for key, value in out.items() if value}
@@ -307,9 +310,11 @@ class _Writer:
         for k, name in enumerate(model.tree.joint_names):
             now = self.file.extras(name)
             wanted = joint_attributes(more, k)
-            new = {key: x for key, x in wanted.items() if now.get(key, 0.0) != x}
+            written = as_written(now | wanted)
+            new = {key for key, x in wanted.items() if now.get(key, 0.0) != x}
+            new |= {"damping"} if new & {DRAG, CUBIC_DRAG} else set()
             if new:
-                self._joint(joints[name].child, new)
+                self._joint(joints[name].child, {key: written[key] for key in new & {*written}})
 
     def _place(self, joint: FileJoint, rotation: spatial.Array, position: spatial.Array) -> None:
         """Where a body stands in its parent, from where its link does at joint angle zero."""
@@ -347,7 +352,7 @@ class _Writer:
         for key in (*OTHER_TURNS, "fullinertia"):
             self.xml.drop(inertial, key)
 
-    def _joint(self, body: str, values: dict[str, float]) -> None:
+    def _joint(self, body: str, values: dict[str, ArrayLike]) -> None:
         element = self._element(body)
         joint = element.child("joint")
         if joint is None:

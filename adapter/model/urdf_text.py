@@ -28,6 +28,7 @@ from adapter.model.tree import BASE
 # Breakaway is by how much more than friction it takes to begin to slide.
 DAMPING, FRICTION, BREAKAWAY = "damping", "friction", "breakaway"
 ARMATURE, STIFFNESS = "armature", "stiffness"
+DRAG, CUBIC_DRAG = "drag", "cubic drag"  # torque per dq |dq| and per dq³
 NO_PLACE = ""
 SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # of a tensor, as URDF names them
 NO_INERTIA = """<inertial>

@@ -33,7 +33,7 @@ from adapter.errors import ModelError, SettingsError
 from adapter.model.filled import PLACES
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS
+from adapter.model.urdf_text import ARMATURE, CUBIC_DRAG, DAMPING, DRAG, FRICTION, STIFFNESS
 from adapter.physics.kernels import jit
 from adapter.physics.rigid_arm import RigidArm
 
@@ -261,7 +261,8 @@ class Effects:
         own = carried + body @ a + asked.torque(u, a)
         # what the simulator takes off at the joints by itself
         pull = self.held(STIFFNESS) * q + self._holds.pull
-        lost = self.held(DAMPING) * u + self.held(FRICTION) * smooth_sign(u)
+        drag = self.held(DAMPING) + self.held(DRAG) * np.abs(u) + self.held(CUBIC_DRAG) * u**2
+        lost = drag * u + self.held(FRICTION) * smooth_sign(u)
         return np.asarray(bias + M @ a + (pull + lost + self.held(ARMATURE) * a) - own)
 
     def measured(

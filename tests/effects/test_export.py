@@ -102,6 +102,8 @@ IN_MJCF = (
     {"effect": "motor_inertia", "joints": [1, 5], "parameters": {"B": [0.15, 0.2]}},
     {"effect": "joint_spring", "joints": [6], "parameters": {"k": 1.5, "q0": -0.4}},
     {"effect": "joint_spring", "joints": [6], "parameters": {"k": 0.5, "q0": 0.8}},
+    {"effect": "law: dq |dq|", "joints": [2, 6], "parameters": {"c": [0.3, 0.4]}},
+    {"effect": "law: dq³", "joints": [2], "parameters": {"c": 0.2}},
 )
 
 
