@@ -423,9 +423,9 @@ def leads_of(table: SignatureTable) -> list[Lead]:
             _keep(best, lead, "whole")
     # a pattern may change in mid-recording as well, but then it is a pattern all the more
     chosen = [x.candidate for x in always.values() if not isinstance(x.candidate.effect, Pattern)]
-    changing = [c for c in chosen if not c.effect.steady]
-    apart = table.apart([c for c in chosen if c in changing or isinstance(c.effect, Law)])
-    for lead in (*apart, *table.timed(changing)):
+    timed = table.timed([c for c in chosen if not c.effect.steady])
+    apart = [c for c in chosen if not c.effect.steady or isinstance(c.effect, Law)]
+    for lead in (*table.apart(apart), *timed):
         if lead.candidate.possible(lead.x, lead.interval_s):
             _keep(best, lead, "timed" if lead.limits > 1 else "apart")
     for lead in table.passing([c for c in chosen if c.effect.passing]):

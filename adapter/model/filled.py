@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from adapter.model import urdf_text as texts
 from adapter.model.inertia import body_from_theta
@@ -115,13 +114,14 @@ def joint_attributes(more: Additions, joint: int) -> dict[str, float]:
     return own
 
 
-def as_written(own: dict[str, float]) -> dict[str, ArrayLike]:
+def as_written(own: dict[str, float]) -> dict[str, float | list[float]]:
     """What a joint has beside, as an MJCF has it: damping with its polynomial in one."""
-    drags = [own.get(place, 0.0) for place in (texts.DRAG, texts.CUBIC_DRAG)]
-    out: dict[str, ArrayLike] = dict(own)
-    for place in (texts.DRAG, texts.CUBIC_DRAG):
-        out.pop(place, None)
-    return out | ({"damping": [own.get("damping", 0.0), *drags]} if any(drags) else {})
+    places = texts.DRAG, texts.CUBIC_DRAG
+    out: dict[str, float | list[float]] = {k: x for k, x in own.items() if k not in places}
+    if len(out) < len(own):  # before MuJoCo 4 there is no polynomial, nor a need where it is zero
+        damping, drags = own.get("damping", 0.0), [own.get(place, 0.0) for place in places]
+        out["damping"] = [damping, *drags] if any(drags) else damping
+    return out
 
 
 def principal(tensor: Array) -> tuple[Array, Array]:

@@ -309,12 +309,10 @@ class _Writer:
             self._body(name, theta)
         for k, name in enumerate(model.tree.joint_names):
             now = self.file.extras(name)
-            wanted = joint_attributes(more, k)
-            written = as_written(now | wanted)
-            new = {key for key, x in wanted.items() if now.get(key, 0.0) != x}
-            new |= {"damping"} if new & {DRAG, CUBIC_DRAG} else set()
+            before, after = as_written(now), as_written(now | joint_attributes(more, k))
+            new = {key: x for key, x in after.items() if before.get(key, 0.0) != x}
             if new:
-                self._joint(joints[name].child, {key: written[key] for key in new & {*written}})
+                self._joint(joints[name].child, new)
 
     def _place(self, joint: FileJoint, rotation: spatial.Array, position: spatial.Array) -> None:
         """Where a body stands in its parent, from where its link does at joint angle zero."""
@@ -352,7 +350,7 @@ class _Writer:
         for key in (*OTHER_TURNS, "fullinertia"):
             self.xml.drop(inertial, key)
 
-    def _joint(self, body: str, values: dict[str, ArrayLike]) -> None:
+    def _joint(self, body: str, values: dict[str, float | list[float]]) -> None:
         element = self._element(body)
         joint = element.child("joint")
         if joint is None:

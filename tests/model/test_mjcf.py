@@ -135,7 +135,8 @@ def test_a_learned_arm_goes_back_into_its_file(arm: Path, tmp_path: Path) -> Non
     )
     found = replace(learned(model, 3), theta=model.theta * 1.1, effects=effects)
     written = robot_mjcf(load_model(save_model(found, tmp_path / "model.json")))
-    assert written.onto == str(arm) and "from version 4 on" in "".join(written.notes)
+    (note,) = written.notes
+    assert written.onto == str(arm) and "from version 4 on" in note
     new = tmp_path / "new.xml"
     new.write_text(written.text)
     judged(new, found)
@@ -144,6 +145,8 @@ def test_a_learned_arm_goes_back_into_its_file(arm: Path, tmp_path: Path) -> Non
     )
     assert number.sub("", written.text) == number.sub("", ARM)
     assert 'frictionloss="0.2"' not in written.text  # the default says it
+    gone = replace(quietly(new), effects=({**effects[-1], "parameters": {"c": 0.0}},))
+    assert re.findall(r'damping="(.*?)"', robot_mjcf(gone, new).text)[-1] == "0.4"
 
 
 def test_what_was_not_learned_anew_is_not_written_anew(arm: Path) -> None:
